@@ -12,6 +12,7 @@ use shadow_repose::train::train;
 use shadow_repose::{bench, export, manual, os, play, plot, ranks, runs, view};
 
 fn main() -> ExitCode {
+    let _queued = os::Queued::begin();
     let command = match cli::parse_from(std::env::args_os()) {
         Ok(cli) => cli.command,
         Err(answer) => return tell(&answer),

@@ -8,6 +8,8 @@ use std::time::SystemTime;
 
 use anyhow::{Context, Result, ensure};
 
+use super::folder::shown;
+
 /// The most bytes of a text file. A configuration takes a few KiB.
 const LARGEST_TEXT: u64 = 1 << 20;
 
@@ -25,7 +27,7 @@ pub trait Cannot<T> {
 
 impl<T> Cannot<T> for io::Result<T> {
     fn cannot(self, do_what: &str, path: &Path) -> Result<T> {
-        self.with_context(|| format!("cannot {do_what} {}", path.display()))
+        self.with_context(|| format!("cannot {do_what} {}", shown(path).display()))
     }
 }
 
@@ -97,7 +99,7 @@ pub fn expect_named(path: &Path, file: &File) -> Result<()> {
     ensure!(
         identity(&named) == identity(&held),
         "{} has been replaced",
-        path.display()
+        shown(path).display()
     );
     Ok(())
 }

@@ -15,6 +15,7 @@ use signal_hook::low_level::{emulate_default_handler, exit};
 use super::machine::process_status;
 use super::output::remove_unfinished;
 use super::pip;
+use super::stderr::drain;
 
 /// Signals within this time are one request to stop: a terminal that is closed sends SIGHUP twice, and some schedulers send both
 /// SIGTERM and SIGHUP.
@@ -23,6 +24,9 @@ const ONE_REQUEST: Duration = Duration::from_secs(1);
 /// The same time for SIGINT. Wrappers that forward Ctrl-C to a program and to its group send it twice. A user who presses it
 /// twice takes longer.
 const ONE_KEY: Duration = Duration::from_millis(200);
+
+/// The time after a request to stop in which a program that saves nothing ends by itself.
+const LONGEST_END: Duration = Duration::from_secs(8);
 
 /// The requests since the program began to listen.
 #[derive(Clone)]
@@ -93,19 +97,19 @@ impl Requests {
             };
             let again = first.is_some_and(|first| first.elapsed() > together);
             if again || !self.patient.load(Ordering::Relaxed) {
-                pip::stop();
-                remove_unfinished();
-                // Ends like a program that never caught the signal, so that the parent process sees the cause. The kernel
-                // does not let a signal end the first process of a container in this way.
-                if !saves && std::process::id() != 1 {
-                    let _ = emulate_default_handler(signal);
-                }
-                exit(128 + signal);
+                end(signal, saves);
             }
             if first.is_none() {
                 first = Some(Instant::now());
                 self.signal.store(signal, Ordering::Relaxed);
                 self.stop.store(true, Ordering::Relaxed);
+                if !saves {
+                    // It may be waiting for the reader of a pipe.
+                    let _ = thread::Builder::new().spawn(move || {
+                        thread::sleep(LONGEST_END);
+                        end(signal, saves)
+                    });
+                }
             }
         }
     }
@@ -135,6 +139,18 @@ impl Requests {
     pub fn take_save(&self) -> bool {
         self.save.swap(false, Ordering::Relaxed)
     }
+}
+
+/// Ends the program at once. One that saves nothing ends like a program that never caught the signal, so that the parent process
+/// sees the cause. The kernel does not let a signal end the first process of a container in this way.
+fn end(signal: i32, saves: bool) -> ! {
+    pip::stop();
+    remove_unfinished();
+    drain();
+    if !saves && std::process::id() != 1 {
+        let _ = emulate_default_handler(signal);
+    }
+    exit(128 + signal)
 }
 
 /// The exit code for a stop that this signal requested: 128 plus its number, or 0 for no signal.

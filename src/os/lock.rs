@@ -1,6 +1,7 @@
 //! The lock of a run folder: only one training process at a time may write to it.
 //!
-//! On a file system without locks, the time of the lock file replaces the lock: it is renewed as long as the training runs.
+//! On a file system without locks, a heartbeat replaces the lock: the lock file changes as long as the training runs. Whoever wants
+//! the folder watches it for some seconds of his own clock, since the dates of files come from another one.
 //!
 //! The file contains the name of its holder. A training run that ends normally removes that name. So a name in a file that nobody
 //! holds means that the training run has failed or was killed.
@@ -11,26 +12,32 @@ use std::os::unix::fs::{FileExt, MetadataExt};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::thread;
-use std::time::{Duration, SystemTime, UNIX_EPOCH};
+use std::time::{Duration, Instant, SystemTime};
 
 use anyhow::{Context, Result, bail, ensure};
 
 use super::file::{Cannot, expect_named};
 use super::machine::Machine;
-use super::output::Unfinished;
-use super::{say, shortened};
+use super::output::{Unfinished, nicety};
+use super::{say, shortened, shown};
 
 /// The name of the lock file.
 pub const LOCK: &str = "run.lock";
 
-/// The time between two renewals of a lock file, where there are no locks.
-const RENEWED_EVERY: Duration = Duration::from_secs(10);
+/// The time between two heartbeats, where there are no locks.
+const BEAT: Duration = Duration::from_secs(1);
 
-/// The age from which such a file no longer counts as a lock.
+/// The time without a heartbeat after which nobody trains any more.
+const WATCHED: Duration = Duration::from_secs(6);
+
+/// The age from which a lock file with a heartbeat is shown as left behind. Two clocks may differ.
 const LAPSED: Duration = Duration::from_secs(60);
 
 /// The time after which a second program that began at the same moment has written its name over this one's.
 const SETTLED: Duration = Duration::from_millis(500);
+
+/// The most bytes of a lock file that are read.
+const LONGEST: u64 = 200;
 
 /// The number of pauses in which a taken lock may become free, and their length. [`Hold::of`] takes a lock for an instant.
 const PAUSES: usize = 5;
@@ -41,8 +48,8 @@ const PAUSE: Duration = Duration::from_millis(20);
 pub struct Locked {
     path: PathBuf,
     file: File,
-    /// Without locks: as long as this lives, the lock file is renewed.
-    renewal: Option<Arc<()>>,
+    /// Without locks: as long as this lives, so does the heartbeat.
+    heart: Option<Arc<()>>,
 }
 
 impl Locked {
@@ -65,20 +72,16 @@ impl Locked {
             .and_then(open)
             .cannot("write", &path)?;
         let mut pauses = 0..PAUSES;
-        let renewal = loop {
+        let heart = loop {
             match file.try_lock() {
                 Ok(()) => break None,
                 Err(TryLockError::WouldBlock) if pauses.next().is_some() => thread::sleep(PAUSE),
                 Err(TryLockError::WouldBlock) => bail!(in_use(folder, &path)),
                 // Some network file systems do not support locks.
-                Err(TryLockError::Error(_)) => break Some(renew(folder, &path)?),
+                Err(TryLockError::Error(_)) => break Some(beat_in(folder, &path)?),
             }
         };
-        Ok(Self {
-            path,
-            file,
-            renewal,
-        })
+        Ok(Self { path, file, heart })
     }
 
     /// Writes the process id into the lock file. A lock file that has other hard links, e.g. in a copied folder, is first
@@ -90,16 +93,17 @@ impl Locked {
         if self.file.metadata().is_ok_and(|facts| facts.nlink() > 1) {
             let own = Unfinished::beside(&self.path);
             let file = File::create_new(&own.path).cannot("write", &self.path)?;
-            let _ = file.try_lock();
+            nicety(file.try_lock());
             fs::rename(&own.path, &self.path).cannot("write", &self.path)?;
             self.file = file;
         }
-        // Best effort: shows others who holds the lock. Where there are no locks, a file without a name does not count as one.
-        let said = name();
-        let _ = self
-            .file
-            .set_len(0)
-            .and_then(|()| self.file.write_all_at(said.as_bytes(), 0));
+        let said = if self.heart.is_some() {
+            beat(0)
+        } else {
+            name()
+        };
+        let cleared = self.file.set_len(0);
+        nicety(cleared.and_then(|()| self.file.write_all_at(said.as_bytes(), 0)));
         Ok(self)
     }
 
@@ -107,13 +111,13 @@ impl Locked {
     pub fn release(self) {
         // The file may belong to another program by now.
         if holder(&self.path) == name() {
-            let _ = self.file.set_len(0);
+            nicety(self.file.set_len(0));
         }
     }
 
     /// Whether the folder still has this lock file. It may have been deleted and created again.
     pub fn holds(&self) -> bool {
-        expect_named(&self.path, &self.file).is_ok()
+        expect_named(&self.path, &self.file).is_ok() && self.expect_own().is_ok()
     }
 
     /// A function that checks the same later, without borrowing the lock.
@@ -125,54 +129,81 @@ impl Locked {
                 .is_ok_and(|file| expect_named(&path, file).is_ok())
         }
     }
+
+    /// Checks that no other program has taken the folder where there are no locks: this one may have been suspended for longer than
+    /// others wait for its heartbeat.
+    ///
+    /// # Errors
+    /// Fails with the name of the other program.
+    pub fn expect_own(&self) -> Result<()> {
+        let taken = self.heart.is_some() && holder(&self.path) != name();
+        ensure!(
+            !taken,
+            in_use(self.path.parent().unwrap_or(&self.path), &self.path)
+        );
+        Ok(())
+    }
 }
 
 impl Drop for Locked {
     fn drop(&mut self) {
-        // The next training need not wait, unless the file belongs to another one by now. The name stays, as in a file
-        // that was locked.
-        if self.renewal.is_some() && holder(&self.path) == name() {
-            set_time(&self.path, UNIX_EPOCH);
+        // The name stays, as in a file that was locked. Without a heartbeat, the next training need not wait.
+        if self.heart.is_some() && holder(&self.path) == name() {
+            nicety(self.file.set_len(name().len() as u64));
         }
     }
 }
 
-/// Writes this program's name into the lock file, and renews it from now on, as long as the result lives.
+/// Writes this program's name and a heartbeat into the lock file from now on, as long as the result lives.
 ///
 /// # Errors
-/// Fails if the file has another name and was renewed a short time ago, or if it cannot be written to.
-fn renew(folder: &Path, path: &Path) -> Result<Arc<()>> {
-    let renewed = fs::metadata(path)
-        .and_then(|facts| facts.modified())
-        .cannot("read", path)?;
-    let age = renewed.elapsed().unwrap_or_default();
-    ensure!(
-        holder(path).is_empty() || age > LAPSED,
-        "{}, or was {} s ago; there are no file locks here, so try again when {LOCK} is a minute old",
-        in_use(folder, path),
-        age.as_secs()
-    );
-    let own = name();
-    fs::write(path, &own).cannot("write", path)?;
+/// Fails if the heart of another program beats in the file, or if it cannot be written to.
+fn beat_in(folder: &Path, path: &Path) -> Result<Arc<()>> {
+    let found = content(path);
+    let watching = Instant::now();
+    while has_beat(&found) && watching.elapsed() < WATCHED {
+        thread::sleep(BEAT / 4);
+        ensure!(
+            content(path) == found,
+            "{}; there are no file locks here, but {LOCK} changes",
+            in_use(folder, path)
+        );
+    }
+    fs::write(path, beat(0)).cannot("write", path)?;
     thread::sleep(SETTLED);
-    ensure!(holder(path) == own, in_use(folder, path));
+    ensure!(holder(path) == name(), in_use(folder, path));
     say!(
-        "note: there are no file locks in {}; {LOCK} is renewed instead",
-        folder.display()
+        "note: there are no file locks in {}; a heartbeat in {LOCK} replaces them",
+        shown(folder).display()
     );
     let file = path.to_owned();
     let lives = Arc::new(());
     let alive = Arc::downgrade(&lives);
-    let renew = move || {
-        while alive.strong_count() > 0 {
-            set_time(&file, SystemTime::now());
-            thread::sleep(RENEWED_EVERY);
+    let keep_beating = move || {
+        for number in 1.. {
+            thread::sleep(BEAT);
+            // The folder may belong to another program by now.
+            if alive.strong_count() == 0 || holder(&file) != name() {
+                return;
+            }
+            let opened = File::options().write(true).open(&file);
+            nicety(opened.and_then(|file| file.write_all_at(beat(number).as_bytes(), 0)));
         }
     };
     thread::Builder::new()
-        .spawn(renew)
+        .spawn(keep_beating)
         .context("cannot start a thread for the lock")?;
     Ok(lives)
+}
+
+/// What the lock file contains at this heartbeat. The length is always the same.
+fn beat(number: u64) -> String {
+    format!("{}\n{number:020}", name())
+}
+
+/// Whether the content of a lock file has a heartbeat.
+fn has_beat(content: &str) -> bool {
+    content.contains('\n')
 }
 
 /// What the lock file of a run folder shows to a reader.
@@ -199,15 +230,14 @@ impl Hold {
         else {
             return Self::Released;
         };
-        let is_renewed = || {
-            facts
-                .modified()
-                .is_ok_and(|time| time.elapsed().unwrap_or_default() <= LAPSED)
+        let beats = || {
+            let is_fresh = |time: SystemTime| time.elapsed().unwrap_or_default() <= LAPSED;
+            has_beat(&content(&path)) && facts.modified().is_ok_and(is_fresh)
         };
         let signed = holder(&path);
         match File::open(&path).map(|file| file.try_lock_shared()) {
             Ok(Err(TryLockError::WouldBlock)) => Self::Held,
-            Ok(Err(TryLockError::Error(_))) if facts.len() > 0 && is_renewed() => Self::Held,
+            Ok(Err(TryLockError::Error(_))) if beats() => Self::Held,
             _ if facts.len() == 0 => Self::Released,
             _ if signed.ends_with(&format!(" on {}", Machine::this().name)) => Self::Left,
             _ => Self::Elsewhere,
@@ -215,26 +245,25 @@ impl Hold {
     }
 }
 
-fn set_time(path: &Path, time: SystemTime) {
-    let _ = File::options()
-        .write(true)
-        .open(path)
-        .and_then(|file| file.set_modified(time));
-}
-
 fn in_use(folder: &Path, lock: &Path) -> String {
     format!(
         "{} is in use by another program{}",
-        folder.display(),
+        shown(folder).display(),
         holder(lock)
     )
 }
 
 /// Who holds the lock file, as it was signed.
 fn holder(path: &Path) -> String {
-    let mut holder = String::new();
-    let _ = File::open(path).and_then(|file| file.take(100).read_to_string(&mut holder));
-    shortened(&holder)
+    shortened(content(path).lines().next().unwrap_or_default())
+}
+
+/// The content of a lock file, or nothing if it cannot be read.
+fn content(path: &Path) -> String {
+    let mut content = String::new();
+    let read = File::open(path).and_then(|file| file.take(LONGEST).read_to_string(&mut content));
+    nicety(read);
+    content
 }
 
 /// The name of this program, as lock files are signed with it.
@@ -296,45 +325,51 @@ mod tests {
         gone.join().unwrap();
     }
 
+    /// A lock as it is taken where there are no locks.
+    fn beating(folder: &Path) -> Result<Locked> {
+        let path = folder.join(LOCK);
+        let open = OpenOptions::new().read(true).write(true).open(&path);
+        let heart = Some(beat_in(folder, &path)?);
+        let file = open.unwrap();
+        Locked { path, file, heart }.sign()
+    }
+
     #[test]
     fn where_there_are_no_locks_the_name_stays_in_a_lock_file_of_its_own_and_anothers_is_left() {
         let place = tempfile::tempdir().unwrap();
         let path = place.path().join(LOCK);
         fs::write(&path, "").unwrap();
         fs::hard_link(&path, place.path().join("copy")).unwrap();
-        let file = OpenOptions::new()
-            .read(true)
-            .write(true)
-            .open(&path)
-            .unwrap();
-        let renewal = Some(renew(place.path(), &path).unwrap());
-        let lock = Locked {
-            path: path.clone(),
-            file,
-            renewal,
-        }
-        .sign()
-        .unwrap();
+        let lock = beating(place.path()).unwrap();
         assert_eq!(holder(&path), name());
         drop(lock);
-        assert_eq!(holder(&path), name(), "it has failed");
-        // The next one need not wait.
-        let file = OpenOptions::new()
-            .read(true)
-            .write(true)
-            .open(&path)
-            .unwrap();
-        let renewal = Some(renew(place.path(), &path).unwrap());
-        let lock = Locked {
-            path: path.clone(),
-            file,
-            renewal,
-        }
-        .sign()
-        .unwrap();
+        assert_eq!(content(&path), name(), "it has failed");
+        let begun = Instant::now();
+        let lock = beating(place.path()).unwrap();
+        assert!(begun.elapsed() < WATCHED, "the next one need not wait");
         fs::write(&path, ": process 1 on another").unwrap();
+        assert!(
+            !lock.holds() && lock.expect_own().is_err(),
+            "it looks again"
+        );
         drop(lock);
         assert_eq!(holder(&path), ": process 1 on another");
+    }
+
+    #[test]
+    fn where_there_are_no_locks_a_heart_that_beats_keeps_others_out_whatever_the_date_is() {
+        let place = tempfile::tempdir().unwrap();
+        let path = place.path().join(LOCK);
+        fs::write(&path, "").unwrap();
+        let _lock = beating(place.path()).unwrap();
+        let long_ago = SystemTime::UNIX_EPOCH;
+        File::open(&path).unwrap().set_modified(long_ago).unwrap();
+        let refusal = beating(place.path()).unwrap_err().to_string();
+        assert!(
+            refusal.contains("is in use") && refusal.contains("changes"),
+            "{refusal}"
+        );
+        assert_eq!(holder(&path), name(), "nothing was written");
     }
 
     #[test]

@@ -2,6 +2,7 @@
 
 mod destination;
 mod file;
+mod folder;
 mod http;
 mod interrupt;
 mod lock;
@@ -13,23 +14,26 @@ mod progress;
 mod screen;
 mod server;
 mod similar;
+mod stderr;
 mod terminal;
 mod threads;
 
 pub use destination::Destination;
 pub use file::{Cannot, Stamp, expect_named, read_bytes, read_text, same_file, stamp};
+pub use folder::{Folder, shown};
 pub use interrupt::{Requests, exit_code};
 pub use lock::{Hold, LOCK, Locked};
 pub use machine::{Machine, processor_seconds, program_checksum};
 pub use meshes::hand_meshes;
 pub use output::{
-    OutputFile, final_path, is_abandoned, make_own, name_also, put_aside, sync_folder, unused_name,
-    write_whole,
+    OutputFile, final_path, is_abandoned, make_own, name_also, nicety, put_aside, sync,
+    sync_folder, unused_name, write_whole,
 };
 pub use progress::{Bar, Status, StatusLine, clock, progress_bar, steps_of_all};
 pub use screen::{Screen, aligned, text_of};
 pub use server::{OnPost, Server};
 pub use similar::similar;
+pub use stderr::{Queued, drain};
 pub(crate) use terminal::say;
 pub use terminal::{
     called_as, harmless, has_display, is_terminal, number, print, quoted, quoted_path, say_line,

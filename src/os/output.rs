@@ -52,7 +52,8 @@ impl Unfinished {
     /// Gives what has been created the name `target`, in place of whatever has it.
     fn become_named(&self, target: &Path) -> io::Result<()> {
         fs::rename(&self.path, target)?;
-        sync_folder(target)
+        sync_folder(target);
+        Ok(())
     }
 }
 
@@ -174,12 +175,11 @@ impl OutputFile {
         let unfinished = Unfinished::beside(&target);
         let file = File::create_new(&unfinished.path).cannot("write", path)?;
         // Held as long as the file is open: others see that somebody writes it.
-        let _ = file.try_lock();
+        nicety(file.try_lock());
         if let Ok(old) = fs::symlink_metadata(&target)
             && old.is_file()
         {
-            file.set_permissions(old.permissions())
-                .cannot("write", path)?;
+            nicety(file.set_permissions(old.permissions()));
         }
         Ok(Self {
             path: path.to_owned(),
@@ -205,8 +205,7 @@ impl OutputFile {
         let Some((unfinished, target)) = &self.names else {
             return Ok(());
         };
-        self.file
-            .sync_all()
+        sync(&self.file)
             .and_then(|()| unfinished.become_named(target))
             .cannot("write", &self.path)
     }
@@ -232,29 +231,46 @@ pub fn write_whole(path: &Path, bytes: &[u8]) -> Result<()> {
 /// Fails if the second name cannot be created.
 pub fn name_also(path: &Path, name: &Path) -> Result<()> {
     let unfinished = Unfinished::beside(name);
-    if fs::hard_link(path, &unfinished.path).is_err() {
+    if nicety(fs::hard_link(path, &unfinished.path)).is_none() {
         return write_whole(name, &read_bytes(path)?);
     }
     unfinished.become_named(name).cannot("write", name)
 }
 
-/// Syncs the folder of a new file: the name of the file is on the disk only once its folder is.
+/// Takes the result of what a file is better with and complete without. Some file systems refuse some of these, so none may fail a
+/// save. They are all that this program does to its files beside writing, reading, renaming and removing:
+///
+/// | what | if it is refused |
+/// |---|---|
+/// | the mode of the file that is replaced | the new file has the default mode |
+/// | the lock of a file that is being written | it counts as abandoned after a day |
+/// | a second name (hard link) | the file is copied |
+/// | the sync of a file, where the system has none | a loss of power may cost the last save |
+/// | the sync of a folder | the same |
+/// | the lock of a run folder | a heartbeat in the lock file replaces it |
+/// | the name of the holder in the lock file | others do not see who trains |
+/// | the removal of an old checkpoint, or of what a crash left | it stays |
+pub fn nicety<T, E>(result: Result<T, E>) -> Option<T> {
+    result.ok()
+}
+
+/// Brings the content of a file onto the disk.
 ///
 /// # Errors
-/// Fails if the folder cannot be read, or if the disk fails.
-pub fn sync_folder(path: &Path) -> io::Result<()> {
-    match File::open(folder_of(path))?.sync_all() {
-        // Some network file systems cannot sync folders, and do not need to.
-        Err(error)
-            if matches!(
-                error.kind(),
-                ErrorKind::InvalidInput | ErrorKind::Unsupported
-            ) =>
-        {
+/// Fails if the disk does, or if it is full. A file system that cannot sync is no reason.
+pub fn sync(file: &File) -> io::Result<()> {
+    use ErrorKind::{InvalidInput, PermissionDenied, Unsupported};
+    match file.sync_all() {
+        Err(error) if matches!(error.kind(), InvalidInput | PermissionDenied | Unsupported) => {
             Ok(())
         }
-        result => result,
+        synced => synced,
     }
+}
+
+/// Syncs the folder of a new file: the name of the file is on the disk only once its folder is.
+pub fn sync_folder(path: &Path) {
+    nicety(File::open(folder_of(path)).and_then(|folder| folder.sync_all()));
 }
 
 /// Gives a file another extension, and a number before it if that name is taken. Returns the new path.
@@ -288,12 +304,9 @@ pub fn unused_name(path: &Path) -> PathBuf {
 ///
 /// # Errors
 /// Fails if the file cannot be written.
-pub fn make_own(path: &Path) -> io::Result<()> {
+pub fn make_own(path: &Path) -> Result<()> {
     if fs::metadata(path).is_ok_and(|facts| facts.nlink() > 1) {
-        let copy = Unfinished::beside(path);
-        fs::copy(path, &copy.path)?;
-        File::open(&copy.path)?.sync_all()?;
-        fs::rename(&copy.path, path)?;
+        write_whole(path, &read_bytes(path)?)?;
     }
     Ok(())
 }

@@ -5,6 +5,7 @@ use std::time::{Duration, Instant};
 use console::Term;
 use indicatif::{ProgressBar, ProgressFinish, ProgressStyle};
 
+use super::stderr::progress_target;
 use super::{is_terminal, number, say, say_line};
 
 /// The time between two plain lines.
@@ -55,7 +56,7 @@ impl StatusLine {
         let bar = (!quiet && is_terminal() && !is_dumb() && wide).then(|| {
             // Cuts off what does not fit, even after the terminal is resized.
             let style = ProgressStyle::with_template("{wide_msg}").expect("the template is valid");
-            let bar = ProgressBar::no_length().with_style(style);
+            let bar = ProgressBar::with_draw_target(None, progress_target()).with_style(style);
             bar.enable_steady_tick(Duration::from_secs(1));
             bar
         });
@@ -227,7 +228,7 @@ pub fn progress_bar(total: u64, items: &str, job: &str) -> Bar {
     let style = ProgressStyle::with_template(&style)
         .expect("the template is valid")
         .progress_chars("=> ");
-    ProgressBar::new(total)
+    ProgressBar::with_draw_target(Some(total), progress_target())
         .with_style(style)
         .with_finish(ProgressFinish::AndClear)
 }

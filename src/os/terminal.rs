@@ -6,6 +6,8 @@ use std::sync::OnceLock;
 
 use anyhow::{Context, Result};
 
+use super::stderr::{drain, say_text};
+
 /// Prints text to stdout. A closed pipe is not an error.
 ///
 /// # Errors
@@ -19,6 +21,8 @@ pub fn print(text: &str) -> Result<()> {
 /// # Errors
 /// Fails as [`print()`] does.
 pub fn is_read(text: &str) -> Result<bool> {
+    // On a terminal, what was said before comes before.
+    drain();
     let mut stdout = std::io::stdout();
     match stdout
         .write_all(text.as_bytes())
@@ -113,11 +117,11 @@ macro_rules! say {
 }
 pub(crate) use say;
 
-/// Prints a line to stderr. Characters that control the terminal are escaped, since the line may quote an untrusted file.
+/// Prints a line to stderr, and does not wait for a reader. Characters that control the terminal are escaped, since the line may quote an untrusted file.
 pub fn say_line(line: &str) {
     let speaker = SPEAKER.get().map_or("", String::as_str);
     let harmless = escaped(line, "\n\t", |c| c.escape_unicode().to_string());
-    let _ = std::io::stderr().write_all(format!("{speaker}{harmless}\n").as_bytes());
+    say_text(format!("{speaker}{harmless}\n"));
 }
 
 /// A text as a single shell word, quoted if necessary.

@@ -97,7 +97,7 @@ pub fn live(
     let mut about = about(&stage, seed);
     if let Some(followed) = &followed {
         about = About {
-            title: followed.run.path.display().to_string(),
+            title: followed.run.place().display().to_string(),
             policy: None,
             ..about
         };

@@ -82,6 +82,7 @@ pub fn together(work: impl FnOnce(&Exchange) -> Result<ExitCode>) -> Result<Exit
             std::thread::sleep(PATIENCE);
         }
         os::say!("error: {error:#}");
+        os::drain();
         exchange.abort()
     })
 }

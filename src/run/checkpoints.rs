@@ -7,7 +7,7 @@ use std::time::SystemTime;
 
 use anyhow::{Result, ensure};
 
-use crate::os::{Cannot, name_also, put_aside, same_file, sync_folder, write_whole};
+use crate::os::{Cannot, Folder, name_also, nicety, put_aside, same_file, shown, write_whole};
 
 /// The folder of the checkpoints in the folder of a run.
 pub const CHECKPOINTS: &str = "checkpoints";
@@ -15,28 +15,51 @@ pub const CHECKPOINTS: &str = "checkpoints";
 /// The folder `checkpoints` of a run.
 #[derive(Clone, Debug)]
 pub struct Checkpoints {
-    pub(super) folder: PathBuf,
+    folder: Folder,
 }
 
 impl Checkpoints {
     pub(super) fn new(run: &Path) -> Self {
         Self {
-            folder: run.join(CHECKPOINTS),
+            folder: Folder::at(run.join(CHECKPOINTS)),
         }
+    }
+
+    /// The path by which they are reached.
+    pub(super) fn path(&self) -> &Path {
+        &self.folder.path
+    }
+
+    /// The path where the folder lies now.
+    pub(super) fn place(&self) -> PathBuf {
+        self.folder.place()
+    }
+
+    /// The folder lies in a run with this path from now on.
+    pub(super) fn lie_in(&mut self, run: &Path) {
+        self.folder.name = run.join(CHECKPOINTS);
+    }
+
+    /// Creates the folder unless it exists, and holds it open.
+    ///
+    /// # Errors
+    /// Fails as [`Folder::hold`] does.
+    pub fn hold(&mut self) -> Result<()> {
+        self.folder.hold()
     }
 
     /// The path of the newest checkpoint.
     pub fn latest(&self) -> PathBuf {
-        self.folder.join("latest.safetensors")
+        self.path().join("latest.safetensors")
     }
 
     /// The path of the checkpoint that scored best.
     pub fn best(&self) -> PathBuf {
-        self.folder.join("best.safetensors")
+        self.path().join("best.safetensors")
     }
 
     fn path_of(&self, iteration: u64) -> PathBuf {
-        self.folder
+        self.path()
             .join(format!("iteration-{iteration:08}.safetensors"))
     }
 
@@ -45,7 +68,6 @@ impl Checkpoints {
     /// # Errors
     /// Fails if the checkpoint cannot be written. The earlier ones are then kept.
     pub fn write(&self, iteration: u64, bytes: &[u8], keep: usize) -> Result<()> {
-        self.create_folder()?;
         let path = self.path_of(iteration);
         write_whole(&path, bytes)?;
         name_also(&path, &self.latest())?;
@@ -55,11 +77,9 @@ impl Checkpoints {
             .numbered()
             .into_iter()
             .partition(|(of, _)| *of > iteration);
-        // Best effort: one checkpoint too many is harmless.
-        earlier
-            .iter()
-            .skip(keep)
-            .for_each(|(_, path)| drop(fs::remove_file(path)));
+        for (_, path) in earlier.iter().skip(keep) {
+            nicety(fs::remove_file(path));
+        }
         later
             .iter()
             .try_for_each(|(_, path)| put_aside(path, "later").map(drop).cannot("rename", path))
@@ -70,7 +90,6 @@ impl Checkpoints {
     /// # Errors
     /// Fails if the checkpoint cannot be written.
     pub fn write_best(&self, bytes: &[u8]) -> Result<()> {
-        self.create_folder()?;
         write_whole(&self.best(), bytes)
     }
 
@@ -80,13 +99,6 @@ impl Checkpoints {
     /// Fails if the file cannot be renamed.
     pub fn put_best_aside(&self) -> Result<PathBuf> {
         put_aside(&self.best(), "damaged").cannot("rename", &self.best())
-    }
-
-    pub(super) fn create_folder(&self) -> Result<()> {
-        expect_no_link(&self.folder)?;
-        fs::create_dir_all(&self.folder)
-            .and_then(|()| sync_folder(&self.folder))
-            .cannot("create", &self.folder)
     }
 
     /// All checkpoints that can be resumed from, the newest first. `latest` is a second name of one of the others, or a
@@ -111,7 +123,7 @@ impl Checkpoints {
 
     /// The checkpoints named after iterations, the newest first.
     fn numbered(&self) -> Vec<(u64, PathBuf)> {
-        let entries = fs::read_dir(&self.folder).into_iter().flatten().flatten();
+        let entries = fs::read_dir(self.path()).into_iter().flatten().flatten();
         let files = entries.filter(|entry| entry.file_type().is_ok_and(|kind| kind.is_file()));
         let numbered = files.filter_map(|entry| {
             let name = entry.file_name();
@@ -142,7 +154,7 @@ pub fn expect_no_link(folder: &Path) -> Result<()> {
     ensure!(
         !folder.is_symlink(),
         "cannot write {}: links in a run folder are not followed",
-        folder.display()
+        shown(folder).display()
     );
     Ok(())
 }
@@ -157,7 +169,7 @@ mod tests {
     use super::*;
 
     fn names(checkpoints: &Checkpoints) -> Vec<String> {
-        let entries = fs::read_dir(&checkpoints.folder).unwrap();
+        let entries = fs::read_dir(checkpoints.path()).unwrap();
         let mut names: Vec<String> = entries
             .map(|entry| entry.unwrap().file_name().into_string().unwrap())
             .collect();
@@ -168,7 +180,8 @@ mod tests {
     #[test]
     fn the_newest_are_kept_and_latest_names_the_newest() {
         let place = tempfile::tempdir().unwrap();
-        let checkpoints = Checkpoints::new(place.path());
+        let mut checkpoints = Checkpoints::new(place.path());
+        checkpoints.hold().unwrap();
         for iteration in [0, 20, 40, 60] {
             checkpoints
                 .write(iteration, format!("{iteration}").as_bytes(), 2)
@@ -210,7 +223,8 @@ mod tests {
     #[test]
     fn later_ones_are_put_aside_when_an_earlier_one_is_gone_on_from() {
         let place = tempfile::tempdir().unwrap();
-        let checkpoints = Checkpoints::new(place.path());
+        let mut checkpoints = Checkpoints::new(place.path());
+        checkpoints.hold().unwrap();
         for iteration in [20, 40, 60, 30] {
             checkpoints.write(iteration, b"", 3).unwrap();
         }
@@ -223,7 +237,8 @@ mod tests {
     #[test]
     fn what_was_there_stays_when_the_next_cannot_be_written() {
         let place = tempfile::tempdir().unwrap();
-        let checkpoints = Checkpoints::new(place.path());
+        let mut checkpoints = Checkpoints::new(place.path());
+        checkpoints.hold().unwrap();
         checkpoints.write(20, b"good", 1).unwrap();
         // A folder with this name cannot be replaced, not even by root.
         fs::create_dir(checkpoints.path_of(40)).unwrap();

@@ -16,7 +16,7 @@ use tensorboard_rs::record_writer::RecordWriter;
 use super::histogram::Histogram;
 use super::records::length_up_to;
 use super::summary::{Descriptions, markdown, value};
-use crate::os::{Cannot, expect_named, make_own, sync_folder};
+use crate::os::{Cannot, expect_named, make_own, sync, sync_folder};
 
 /// The prefix and the suffix of the names of event files.
 const NAME: [&str; 2] = ["events.out.tfevents.", ".shadow-repose"];
@@ -78,7 +78,8 @@ impl EventFile {
             let settings = Content::tensor(markdown(&format!("```\n{settings}\n```\n")));
             self.summary([(SETTINGS, settings)].into_iter(), first_step)?;
         }
-        Ok(sync_folder(&self.path)?)
+        sync_folder(&self.path);
+        Ok(())
     }
 
     /// Adds the values of one step and flushes. `NaN` values are left out.
@@ -146,7 +147,7 @@ impl EventFile {
     /// Fails if the file cannot be written, or was deleted.
     pub fn sync(&mut self) -> Result<()> {
         expect_named(&self.path, &self.file)?;
-        self.file.sync_data().cannot("write", &self.path)
+        sync(&self.file).cannot("write", &self.path)
     }
 }
 
@@ -157,16 +158,18 @@ impl EventFile {
 /// Fails if a file cannot be read or written.
 pub fn cut_off_after(folder: &Path, last_step: u64) -> Result<()> {
     for (_, path) in event_files(folder)? {
-        let cut = || {
+        let measure = || {
             let file = File::open(&path)?;
             let kept = length_up_to(BufReader::new(&file), last_step)?;
-            if kept == file.metadata()?.len() {
-                return Ok(());
-            }
-            make_own(&path)?;
-            OpenOptions::new().write(true).open(&path)?.set_len(kept)
+            Ok((kept, file.metadata()?.len()))
         };
-        cut().cannot("shorten", &path)?;
+        let (kept, length) = measure().cannot("read", &path)?;
+        if kept < length {
+            make_own(&path)?;
+            let cut = OpenOptions::new().write(true).open(&path);
+            cut.and_then(|file| file.set_len(kept))
+                .cannot("shorten", &path)?;
+        }
     }
     Ok(())
 }

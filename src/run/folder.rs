@@ -11,7 +11,8 @@ use anyhow::{Context, Result, bail, ensure};
 use super::checkpoints::{CHECKPOINTS, Checkpoints, expect_no_link, modified};
 use super::hparams::HPARAMS;
 use crate::os::{
-    Cannot, LOCK, Locked, is_abandoned, read_text, sync_folder, unused_name, write_whole,
+    Cannot, Folder, LOCK, Locked, is_abandoned, nicety, read_text, same_file, shown, sync_folder,
+    unused_name, write_whole,
 };
 
 /// The default folder of runs.
@@ -57,11 +58,11 @@ pub fn is_one_of(name: &OsStr, patterns: &[&str]) -> bool {
         })
 }
 
-/// A run folder: `config.toml`, `version.txt`, `metrics.csv`, event files, `policy.safetensors`, checkpoints.
+/// A run folder: `config.toml`, `version.txt`, `metrics.csv`, event files, `policy.safetensors`, checkpoints. A training run holds
+/// its folder and the checkpoints open from [`RunFolder::lock`] on, so that it writes into no other.
 #[derive(Clone, Debug)]
 pub struct RunFolder {
-    /// Its path.
-    pub path: PathBuf,
+    folder: Folder,
     /// Its checkpoints.
     pub checkpoints: Checkpoints,
     /// The time of a file `stop` that was there before this session.
@@ -73,7 +74,31 @@ impl RunFolder {
         Self {
             checkpoints: Checkpoints::new(&path),
             stop_before: modified(&path.join(STOP)),
-            path,
+            folder: Folder::at(path),
+        }
+    }
+
+    /// The path by which its files are reached.
+    pub fn path(&self) -> &Path {
+        &self.folder.path
+    }
+
+    /// The path where it lies now.
+    pub fn place(&self) -> PathBuf {
+        self.folder.place()
+    }
+
+    /// Where it lies now, and where its checkpoints lie if that is elsewhere.
+    pub fn whereabouts(&self) -> String {
+        let (run, checkpoints) = (self.place(), shown(&self.checkpoints.place()));
+        let run = run.display();
+        if same_file(&checkpoints, &self.path().join(CHECKPOINTS)) {
+            run.to_string()
+        } else {
+            format!(
+                "{run}, and its checkpoints lie in {}",
+                checkpoints.display()
+            )
         }
     }
 
@@ -82,14 +107,13 @@ impl RunFolder {
     /// # Errors
     /// Fails if the folder already holds a run, lies inside one, or cannot be written to.
     pub fn create(path: Option<&Path>, name: Option<&str>) -> Result<(Self, Locked)> {
-        let run = Self::at(path.map_or_else(|| create_unused(name), |path| Ok(path.to_owned()))?);
+        let mut run =
+            Self::at(path.map_or_else(|| create_unused(name), |path| Ok(path.to_owned()))?);
         run.expect_free()?;
-        let created = fs::create_dir_all(&run.path).and_then(|()| sync_folder(&run.path));
-        created.cannot("create the run folder", &run.path)?;
         let lock = run.lock()?;
+        sync_folder(&run.place());
         // Another training run may have started and ended in the meantime.
         run.expect_free()?;
-        run.checkpoints.create_folder()?;
         let lock = run.claim(lock)?;
         Ok((run, lock))
     }
@@ -101,7 +125,7 @@ impl RunFolder {
         let is_half_begun = names
             .iter()
             .all(|name| is_one_of(name, &[LOCK, POLICY, CHECKPOINTS, PARTIAL]))
-            && self.path.join(LOCK).exists()
+            && self.path().join(LOCK).exists()
             && !self.checkpoints.begun();
         // An unfinished trace does not belong to a run.
         if let Some(name) = names.iter().find(|name| !is_one_of(name, &[PARTIAL]))
@@ -109,23 +133,23 @@ impl RunFolder {
         {
             bail!(
                 "{} already holds a run, or part of one ({}); resume it, or choose another folder",
-                self.path.display(),
+                self.place().display(),
                 name.to_string_lossy()
             );
         }
-        let whole = std::path::absolute(&self.path).cannot("find", &self.path)?;
+        let whole = std::path::absolute(self.place()).cannot("find", self.path())?;
         let there = whole
             .ancestors()
             .find_map(|folder| folder.canonicalize().ok())
             .unwrap_or_default();
         let above = there.ancestors().skip(usize::from(whole.exists()));
         for folder in above.map(|path| Self::at(path.to_owned())) {
-            let holds_a_run = folder.checkpoints.begun() || folder.path.join(LOCK).exists();
+            let holds_a_run = folder.checkpoints.begun() || folder.path().join(LOCK).exists();
             ensure!(
                 !holds_a_run,
                 "{} lies inside the run {}",
-                self.path.display(),
-                folder.path.display()
+                self.place().display(),
+                folder.path().display()
             );
         }
         Ok(())
@@ -137,30 +161,25 @@ impl RunFolder {
     /// Fails if the folder cannot be created.
     pub fn for_now() -> Result<Self> {
         let folder = tempfile::Builder::new().prefix("shadow-repose-").tempdir();
-        Ok(Self::at(
-            folder
-                .cannot("create a folder in", &std::env::temp_dir())?
-                .keep(),
-        ))
+        let folder = folder.cannot("create a folder in", &std::env::temp_dir())?;
+        let mut run = Self::at(folder.keep());
+        run.checkpoints.hold()?;
+        Ok(run)
     }
 
     /// Removes the files of a run that could not start, and its folder if nothing else is in it.
     pub fn clear(&self) {
         for entry in self.entries().into_iter().flatten() {
-            let _ = fs::remove_file(entry.path());
+            nicety(fs::remove_file(entry.path()));
         }
-        for folder in [
-            &self.checkpoints.folder,
-            &self.path.join(HPARAMS),
-            &self.path,
-        ] {
-            let _ = fs::remove_dir(folder);
+        for folder in [CHECKPOINTS, HPARAMS, ""] {
+            nicety(fs::remove_dir(self.place().join(folder)));
         }
     }
 
     /// Removes a folder in which nothing could be saved.
     pub fn remove(self) {
-        let _ = fs::remove_dir_all(self.path);
+        nicety(fs::remove_dir_all(self.place()));
     }
 
     /// The existing run folder that `place` belongs to: `place` is the folder itself, its checkpoints folder, or a
@@ -192,19 +211,21 @@ impl RunFolder {
             ),
         };
         // A folder that may not be listed or entered would look empty.
-        let folder = &run.checkpoints.folder;
+        let folder = run.checkpoints.path();
         match fs::read_dir(folder).and_then(|_| fs::metadata(folder.join("."))) {
             Err(error) if error.kind() != ErrorKind::NotFound => Err(error).cannot("read", folder),
             _ => Ok(run),
         }
     }
 
-    /// Locks the folder against other training processes for as long as the result lives. Creates the lock file if it is
-    /// missing, and changes nothing else.
+    /// Locks the folder against other training processes for as long as the result lives, and holds it open. Creates the folder, the
+    /// folder of checkpoints and the lock file if they are missing, and changes nothing else.
     ///
     /// # Errors
-    /// Fails if another training process uses the folder, if it contains a link, or if it cannot be written to.
-    pub fn lock(&self) -> Result<Locked> {
+    /// Fails if another training process uses the folder, if it contains a link, or if it cannot be written to. Fails if the folder
+    /// was held and deleted, and something else lies there now.
+    pub fn lock(&mut self) -> Result<Locked> {
+        self.folder.hold()?;
         // The folder is untrusted, and will be written to.
         for entry in self.entries()? {
             let path = entry.path();
@@ -212,10 +233,13 @@ impl RunFolder {
             ensure!(
                 kind.is_file() || kind.is_dir(),
                 "{}: neither a file nor a folder; links in a run folder are not followed",
-                path.display()
+                shown(&path).display()
             );
         }
-        Locked::acquire(&self.path)
+        let lock = Locked::acquire(self.path())?;
+        self.checkpoints.lie_in(&self.folder.path);
+        self.checkpoints.hold()?;
+        Ok(lock)
     }
 
     /// Prepares a locked folder for writing: removes files that a crash left incomplete, and signs the lock.
@@ -225,7 +249,7 @@ impl RunFolder {
     pub fn claim(&self, lock: Locked) -> Result<Locked> {
         for entry in self.entries()? {
             if is_abandoned(&entry) {
-                fs::remove_file(entry.path()).cannot("remove", &entry.path())?;
+                nicety(fs::remove_file(entry.path()));
             }
         }
         lock.sign()
@@ -236,7 +260,7 @@ impl RunFolder {
     fn entries(&self) -> Result<Vec<DirEntry>> {
         let mut found = Vec::new();
         for name in ["", CHECKPOINTS, DIVERGED, HPARAMS] {
-            let folder = self.path.join(name);
+            let folder = self.path().join(name);
             if !folder.exists() {
                 continue;
             }
@@ -253,7 +277,7 @@ impl RunFolder {
     /// Whether the user asks by an empty file `stop` to end the training run. The file is then removed. Any other file of that name,
     /// and one that was there before, is the user's.
     pub fn take_stop(&self) -> bool {
-        let path = self.path.join(STOP);
+        let path = self.path().join(STOP);
         let is_request =
             fs::symlink_metadata(&path).is_ok_and(|facts| facts.is_file() && facts.len() == 0);
         is_request && modified(&path) != self.stop_before && fs::remove_file(path).is_ok()
@@ -262,21 +286,21 @@ impl RunFolder {
     /// Writes or removes the file that marks a training run as not to be continued: all steps are made, or a file `stop` has ended
     /// it. If that fails, a script at most continues what is finished.
     pub fn mark_finished(&self, finished: bool) {
-        let path = self.path.join(FINISHED);
+        let path = self.path().join(FINISHED);
         // A file with content is the user's.
         if fs::metadata(&path).is_ok_and(|facts| facts.len() > 0) {
             return;
         }
-        let _ = if finished {
+        nicety(if finished {
             write_whole(&path, b"")
         } else {
             fs::remove_file(path).map_err(Into::into)
-        };
+        });
     }
 
     /// The path of the policy without its training state: the best one, or the latest if none was scored yet.
     pub fn policy(&self) -> PathBuf {
-        self.path.join(POLICY)
+        self.path().join(POLICY)
     }
 
     /// Writes a report of what led to a diverged state, unless there are very many already.
@@ -284,7 +308,7 @@ impl RunFolder {
     /// # Errors
     /// Fails if the folder cannot be written to.
     pub fn dump(&self, name: &str, text: &str) -> Result<()> {
-        let folder = self.path.join(DIVERGED);
+        let folder = self.path().join(DIVERGED);
         expect_no_link(&folder)?;
         fs::create_dir_all(&folder).cannot("create", &folder)?;
         if fs::read_dir(&folder).is_ok_and(|entries| entries.count() >= MOST_DUMPS) {
@@ -298,9 +322,9 @@ impl RunFolder {
     /// # Errors
     /// Fails if the file cannot be read.
     pub fn config(&self) -> Result<Option<(PathBuf, String)>> {
-        let path = self.path.join(CONFIG);
+        let path = self.path().join(CONFIG);
         if path.exists() {
-            read_text(&path).map(|text| Some((path, text)))
+            read_text(&path).map(|text| Some((shown(&path), text)))
         } else {
             Ok(None)
         }
@@ -312,7 +336,7 @@ impl RunFolder {
     /// Fails if the folder cannot be written to.
     pub fn describe(&self, config: &str, version: &str) -> Result<()> {
         for (name, text) in [(CONFIG, config), (VERSION, version)] {
-            let path = self.path.join(name);
+            let path = self.path().join(name);
             if read_text(&path).ok().as_deref() != Some(text) {
                 write_whole(&path, text.as_bytes())?;
             }
@@ -350,7 +374,7 @@ pub fn newest_run() -> Option<PathBuf> {
         .flatten()
         .map(|entry| RunFolder::at(entry.path()));
     // Ordered by the time of the latest checkpoint, so that a resumed run counts as new.
-    runs.filter_map(|run| Some((modified(&run.checkpoints.latest())?, run.path)))
+    runs.filter_map(|run| Some((modified(&run.checkpoints.latest())?, run.place())))
         .max()
         .map(|(_, path)| path)
 }
@@ -387,7 +411,6 @@ fn create_unused(name: Option<&str>) -> Result<PathBuf> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::os::same_file;
 
     #[test]
     fn a_folder_that_holds_a_run_is_not_taken_again() {
@@ -419,15 +442,15 @@ mod tests {
             "events.out.tfevents.1.2.shadow-repose",
             "checkpoints/x.partial",
         ] {
-            let run = RunFolder::at(place.path().join("run"));
-            run.checkpoints.create_folder().unwrap();
-            std::os::unix::fs::symlink(&victim, run.path.join(name)).unwrap();
+            let mut run = RunFolder::at(place.path().join("run"));
+            fs::create_dir_all(run.checkpoints.path()).unwrap();
+            std::os::unix::fs::symlink(&victim, run.path().join(name)).unwrap();
             let refusal = run.lock().unwrap_err().to_string();
             assert!(
                 refusal.contains(name) && refusal.contains("not followed"),
                 "{refusal}"
             );
-            fs::remove_dir_all(&run.path).unwrap();
+            fs::remove_dir_all(run.place()).unwrap();
         }
         // A link that appears later is replaced, not written through.
         std::os::unix::fs::symlink(&victim, place.path().join("config.toml.partial")).unwrap();
@@ -452,10 +475,10 @@ mod tests {
     #[test]
     fn what_a_crash_left_half_written_is_removed() {
         let place = tempfile::tempdir().unwrap();
-        let (run, lock) = RunFolder::create(Some(place.path()), None).unwrap();
+        let (mut run, lock) = RunFolder::create(Some(place.path()), None).unwrap();
         let left = run
             .checkpoints
-            .folder
+            .path()
             .join(".shadow-repose-999999999-0.partial");
         fs::write(&left, "half").unwrap();
         let living = crate::os::OutputFile::create(&place.path().join("trace")).unwrap();
@@ -497,14 +520,14 @@ mod tests {
         let (run, _lock) = RunFolder::create(Some(&place.path().join("run")), None).unwrap();
         let here = std::env::current_dir().unwrap();
         let up: PathBuf = here.ancestors().skip(1).map(|_| "..").collect();
-        let relative = up.join(run.path.strip_prefix("/").unwrap()).join("new");
+        let relative = up.join(run.place().strip_prefix("/").unwrap()).join("new");
         assert!(RunFolder::create(Some(&relative), None).is_err() && !relative.exists());
         for inside in ["checkpoints", "new/deeper"] {
-            let refusal = RunFolder::create(Some(&run.path.join(inside)), None)
+            let refusal = RunFolder::create(Some(&run.place().join(inside)), None)
                 .unwrap_err()
                 .to_string();
             assert!(
-                refusal.contains("lies inside the run") && !run.path.join("new").exists(),
+                refusal.contains("lies inside the run") && !run.path().join("new").exists(),
                 "{refusal}"
             );
         }
@@ -515,10 +538,10 @@ mod tests {
         let place = tempfile::tempdir().unwrap();
         let (run, _lock) = RunFolder::create(Some(&place.path().join("run")), None).unwrap();
         write_whole(&run.checkpoints.latest(), b"latest").unwrap();
-        let found = RunFolder::containing(&run.checkpoints.folder).unwrap();
-        assert!(same_file(&found.path, &run.path), "{found:?}");
+        let found = RunFolder::containing(run.checkpoints.path()).unwrap();
+        assert!(same_file(found.path(), run.path()), "{found:?}");
         assert!(same_file(
-            &resolve_checkpoint(&run.checkpoints.folder).unwrap(),
+            &resolve_checkpoint(run.checkpoints.path()).unwrap(),
             &run.checkpoints.latest()
         ));
     }
@@ -530,17 +553,14 @@ mod tests {
         assert!(resolve_checkpoint(place.path()).is_err());
         let checkpoints = &run.checkpoints;
         write_whole(&checkpoints.latest(), b"latest").unwrap();
-        assert_eq!(
-            resolve_checkpoint(place.path()).unwrap(),
-            checkpoints.latest()
-        );
+        let means = |path: &Path| same_file(&resolve_checkpoint(place.path()).unwrap(), path);
+        assert!(means(&checkpoints.latest()));
         write_whole(&checkpoints.best(), b"best").unwrap();
+        assert!(means(&checkpoints.best()));
         assert_eq!(
-            resolve_checkpoint(place.path()).unwrap(),
-            checkpoints.best()
-        );
-        assert_eq!(
-            RunFolder::containing(&checkpoints.latest()).unwrap().path,
+            RunFolder::containing(&checkpoints.latest())
+                .unwrap()
+                .place(),
             place.path().canonicalize().unwrap()
         );
     }

@@ -55,13 +55,13 @@ pub fn expect_output<'a>(
             .unwrap_or(folder)
             .to_owned(),
     );
-    let is_run = run.checkpoints.begun() || run.path.join(LOCK).exists();
+    let is_run = run.checkpoints.begun() || run.path().join(LOCK).exists();
     let is_kept = if inside {
         is_one_of(name, &INSIDE)
     } else {
         name == FINISHED || is_one_of(name, &OURS)
     };
-    let place = run.path.display();
+    let place = run.path().display();
     ensure!(
         !is_run || !is_kept,
         "{}: the run {place} reserves this file name; choose another name",

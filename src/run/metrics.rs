@@ -10,7 +10,7 @@ use std::path::{Path, PathBuf};
 use anyhow::Result;
 
 use super::folder::METRICS;
-use crate::os::{Cannot, expect_named, make_own, put_aside, sync_folder};
+use crate::os::{Cannot, expect_named, make_own, put_aside, shown, sync, sync_folder};
 
 /// The most bytes of a row. This program writes none that is longer, and the rest of a longer one is not a row either.
 const LONGEST_ROW: u64 = 1 << 20;
@@ -45,6 +45,7 @@ impl Metrics {
         if found.is_none() {
             let aside =
                 put_aside(path, &format!("before-{}.csv", iterations.end)).cannot("write", path)?;
+            let aside = shown(&aside);
             let aside = aside.display();
             tell(&format!(
                 "{METRICS} has a different header from the one this program writes; it was renamed to {aside}"
@@ -58,7 +59,7 @@ impl Metrics {
                 found.dropped, iterations.end
             ));
         }
-        make_own(path).cannot("write", path)?;
+        make_own(path)?;
         let file = OpenOptions::new()
             .write(true)
             .create(true)
@@ -80,7 +81,7 @@ impl Metrics {
         metrics.repair().cannot("write", path)?;
         if found.length == 0 {
             metrics.row(&format!("{header}\n"))?;
-            sync_folder(path).cannot("write", path)?;
+            sync_folder(path);
         }
         Ok(metrics)
     }
@@ -112,7 +113,7 @@ impl Metrics {
     pub fn sync(&mut self) -> Result<()> {
         expect_named(&self.path, &self.file)?;
         self.repair()
-            .and_then(|()| self.file.sync_data())
+            .and_then(|()| sync(&self.file))
             .cannot("write", &self.path)
     }
 }

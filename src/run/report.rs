@@ -3,7 +3,6 @@
 //! A log that cannot be written causes a warning and never ends the training run. Lost iterations are counted, and the log is
 //! opened again at the next checkpoint.
 
-use std::fs;
 use std::ops::Range;
 use std::path::{Path, PathBuf};
 
@@ -20,7 +19,8 @@ use crate::os::{Status, StatusLine};
 
 /// The logs and the progress line of a training run.
 pub struct Report {
-    folder: PathBuf,
+    /// The path of the run folder.
+    pub folder: PathBuf,
     header: String,
     /// The descriptions of all that is logged, for TensorBoard.
     pub descriptions: Descriptions,
@@ -225,8 +225,6 @@ impl Report {
         self.metrics.sync(&self.progress, Metrics::sync);
         self.events.sync(&self.progress, EventFile::sync);
         self.session.sync(&self.progress, EventFile::sync);
-        // The whole folder may have been deleted.
-        let _ = fs::create_dir_all(&self.folder);
         self.open();
     }
 
@@ -256,6 +254,8 @@ impl Report {
 
 #[cfg(test)]
 mod tests {
+    use std::fs;
+
     use super::*;
 
     fn status(env_steps: u64) -> Status {
@@ -307,6 +307,7 @@ mod tests {
         let mut report = open(&folder, &["a"], 0, 0);
         report.iteration(1, &[("a", 1.0)], &[], &status(10));
         assert_eq!((report.metrics.lost, report.events.lost), (1, 1));
+        fs::create_dir(&folder).unwrap();
         report.sync();
         report.iteration(2, &[("a", 2.0)], &[], &status(20));
         assert_eq!(
@@ -315,6 +316,7 @@ mod tests {
         );
         // Deleted during the run, which is noticed at the next checkpoint.
         fs::remove_dir_all(&folder).unwrap();
+        fs::create_dir(&folder).unwrap();
         report.iteration(3, &[("a", 3.0)], &[], &status(30));
         report.sync();
         assert_eq!(

@@ -255,9 +255,11 @@ impl RunState {
         let age = glance
             .logged
             .map(|logged| now.duration_since(logged).unwrap_or_default());
+        // One that could not save its end has neither the mark nor released its lock.
+        let has_ended = glance.is_marked || glance.hold == Hold::Released;
         match glance.hold {
             Hold::Held => Self::Training,
-            _ if all.unwrap_or(glance.is_marked) => Self::Finished,
+            _ if has_ended && all.unwrap_or(glance.is_marked) => Self::Finished,
             _ if glance.is_marked => Self::Stopped,
             Hold::Elsewhere if age.is_some_and(|age| age < SILENT) => Self::Training,
             Hold::Released => Self::Stopped,
@@ -300,7 +302,13 @@ mod tests {
             RunState::Training,
             "resumed with more steps, before its first iteration"
         );
-        assert_eq!(state(Left, false, Some(9), 500), RunState::Finished);
+        assert_eq!(state(Left, true, Some(9), 500), RunState::Finished);
+        assert_eq!(state(Released, false, Some(9), 500), RunState::Finished);
+        assert_eq!(
+            state(Left, false, Some(9), 500),
+            RunState::Failed,
+            "its end could not be saved"
+        );
         assert_eq!(
             state(Released, true, None, 500),
             RunState::Finished,

@@ -56,9 +56,7 @@ fn report_fatal(message: &MjLogMessage) {
     // A panic must not unwind through MuJoCo's frames.
     let _ = catch_unwind(AssertUnwindSafe(|| match rescue.take() {
         Some(rescue) => rescue(&said),
-        None => {
-            let text = format!("error: {said}\n");
-            let _ = std::io::Write::write_all(&mut std::io::stderr(), text.as_bytes());
-        }
+        None => crate::os::say!("error: {said}"),
     }));
+    crate::os::drain();
 }

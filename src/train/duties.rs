@@ -40,7 +40,7 @@ pub trait Duties {
     /// Reports an iteration.
     ///
     /// # Errors
-    /// Fails if the run folder cannot be written to for the first time.
+    /// Fails if the run folder cannot be written to for the first time, or if another training run has taken it.
     fn report(&mut self, _session: &Session, _outcome: &Outcome) -> Result<()> {
         Ok(())
     }
@@ -73,7 +73,7 @@ impl Lead {
         let config = &session.config;
         let tags = tags(config.randomization.happens());
         let progress = StatusLine::new(session.agent.env_steps, config.run.total_steps, quiet);
-        let mut report = Report::new(&saver.held.folder.path, &tags, progress);
+        let mut report = Report::new(saver.held.folder.path(), &tags, progress);
         report.descriptions = described(&tags);
         report.settings = config.to_text();
         report.hparams = config.dotted();
@@ -171,13 +171,13 @@ impl Lead {
         say!(
             "{why}: {}; {}",
             held.steps_made(),
-            held.folder.path.display()
+            held.folder.place().display()
         );
         if let Some(rise) = &session.rise {
             os::say_line(&before_and_after(rise, session.config.run.eval_episodes));
         }
         if !self.quiet {
-            say_what_next(&held.folder.path, &session.config.env);
+            say_what_next(&held.folder.place(), &session.config.env);
         }
         self.saver.release();
     }
@@ -232,6 +232,7 @@ impl Duties for Lead {
     }
 
     fn report(&mut self, session: &Session, outcome: &Outcome) -> Result<()> {
+        self.saver.expect_own()?;
         self.saver.open_folder(&mut self.report)?;
         for (name, text) in &outcome.dumps {
             let dumped = self.saver.held.folder.dump(name, text);

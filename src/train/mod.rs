@@ -47,7 +47,7 @@ pub fn train(args: &TrainArgs, requests: &Requests) -> Result<ExitCode> {
 /// Trains, reports and saves.
 fn lead(args: &TrainArgs, requests: &Requests, exchange: &Exchange) -> Result<ExitCode> {
     let (mut session, saver) = Session::lead(args, exchange)?;
-    let place = saver.held.folder.path.display().to_string();
+    let place = saver.held.folder.place().display().to_string();
     if session.finished() {
         let advice = match session.is_flat() {
             true => "its evaluations no longer rise; use --fork to continue",
@@ -334,7 +334,6 @@ mod tests {
             &TrainArgs::default(),
             &session.config,
             session.checkpoint(),
-            false,
         )
     }
 

@@ -22,10 +22,10 @@ pub struct Saver {
     /// What is to be saved, and where.
     pub held: Held,
     lock: Option<Locked>,
+    /// Where the folder lies, as the user was last told.
+    told: String,
     /// The state that this session started from.
     initial: Arc<Checkpoint>,
-    /// Whether that is the newest checkpoint in the folder.
-    from_newest: bool,
 }
 
 /// What is to be saved, and where.
@@ -48,14 +48,12 @@ pub struct Held {
 }
 
 impl Saver {
-    /// Creates the saver of a training run with these options and settings at its `initial` state, which may be the newest checkpoint
-    /// in the folder.
+    /// Creates the saver of a training run with these options and settings at its `initial` state.
     pub fn new(
         (folder, lock): (RunFolder, Locked),
         args: &TrainArgs,
         config: &Config,
         initial: Checkpoint,
-        from_newest: bool,
     ) -> Self {
         let options = format!(
             "{}{}",
@@ -84,10 +82,10 @@ impl Saver {
             best_is_saved: true,
         };
         let saver = Self {
+            told: held.folder.whereabouts(),
             held,
             lock: Some(lock),
             initial,
-            from_newest,
         };
         saver.save_before_fatal_errors();
         saver
@@ -106,7 +104,7 @@ impl Saver {
 
     /// Writes into the folder for the first time, unless that is done. The order is the checkpoint that the training run starts
     /// from (as the newest), the logs (cut off after it), and the settings. So a run that is killed in between can be
-    /// resumed.
+    /// resumed, and no row is cut off where nothing can be written.
     ///
     /// # Errors
     /// Fails if the folder cannot be written to.
@@ -114,12 +112,9 @@ impl Saver {
         if self.held.wrote {
             return Ok(());
         }
-        let lock = match self.lock.take().filter(Locked::holds) {
-            Some(lock) => lock,
-            // The folder was deleted during the first iteration.
-            None => self.held.folder.lock()?,
-        };
-        self.lock = Some(self.held.folder.claim(lock)?);
+        self.own_folder(report)?;
+        let lock = self.lock.take().map(|lock| self.held.folder.claim(lock));
+        self.lock = lock.transpose()?;
         let best = self.held.folder.checkpoints.best();
         if load::read(&best).is_err_and(|error| load::is_damage(&error)) {
             let aside = self.held.folder.checkpoints.put_best_aside()?;
@@ -129,9 +124,7 @@ impl Saver {
                 aside.display()
             ));
         }
-        if !self.from_newest || self.held.folder.checkpoints.newest_first().is_empty() {
-            write(&self.held.folder, None, &self.initial, self.held.keep)?;
-        }
+        write(&self.held.folder, None, &self.initial, self.held.keep)?;
         let Progress {
             iteration,
             env_steps,
@@ -146,6 +139,37 @@ impl Saver {
         self.held.folder.mark_finished(false);
         self.held.wrote = true;
         self.save_before_fatal_errors();
+        Ok(())
+    }
+
+    /// Checks that no other training run has taken the folder where there are no locks.
+    ///
+    /// # Errors
+    /// Fails as [`Locked::expect_own`] does.
+    pub fn expect_own(&self) -> Result<()> {
+        self.lock.as_ref().map_or(Ok(()), Locked::expect_own)
+    }
+
+    /// Ensures that the folder is still the one that was opened, and locked. One that was deleted is created again. Says so if it was
+    /// moved.
+    ///
+    /// # Errors
+    /// Fails if another training run uses it, or if something else lies where it was deleted.
+    fn own_folder(&mut self, report: &mut Report) -> Result<()> {
+        let folder = &mut self.held.folder;
+        if !self.lock.as_ref().is_some_and(Locked::holds) {
+            let lock = folder.lock()?;
+            self.lock = Some(folder.claim(lock)?);
+        }
+        folder.checkpoints.hold()?;
+        report.folder = folder.path().to_owned();
+        let place = folder.whereabouts();
+        if self.told != place {
+            report
+                .progress
+                .say(&format!("note: the run folder was moved: {place}"));
+            self.told = place;
+        }
         Ok(())
     }
 
@@ -177,10 +201,7 @@ impl Saver {
     /// # Errors
     /// Fails if the folder cannot be written to.
     pub fn save(&mut self, report: &mut Report) -> Result<()> {
-        if !self.lock.as_ref().is_some_and(Locked::holds) {
-            // The folder was deleted: create it again, unless another training run has done so.
-            self.lock = Some(self.held.folder.claim(self.held.folder.lock()?)?);
-        }
+        self.own_folder(report)?;
         report.sync();
         self.describe()?;
         self.held.write(&self.held.folder, self.held.keep)?;
@@ -220,7 +241,7 @@ impl Saver {
             if !held.wrote {
                 return say!("the run folder was not changed");
             }
-            let replaced = || anyhow!("{} has been replaced", held.folder.path.display());
+            let replaced = || anyhow!("{} has been replaced", held.folder.place().display());
             let ours = holds
                 .is_some_and(|holds| holds())
                 .then_some(())
@@ -270,7 +291,7 @@ impl Held {
             Ok(run) => anyhow!(
                 "{reason:#}\nThe state after {} iterations is in {} instead; resume with\n  {}",
                 self.last.progress.iteration,
-                run.path.display(),
+                run.place().display(),
                 self.how_to_resume(&run)
             ),
             Err(error) => anyhow!(
@@ -285,7 +306,7 @@ impl Held {
         format!(
             "{} train --resume {}{}",
             os::called_as(),
-            os::quoted_path(&run.path),
+            os::quoted_path(&run.place()),
             self.options
         )
     }

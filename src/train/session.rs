@@ -49,20 +49,11 @@ impl Session {
         let (plan, existing) = Plan::of(args)?;
         let session = Self::set_up(plan, exchange)?;
         // A new folder is created last, so that a training run that cannot be set up leaves none behind.
-        let (place, from_newest) = match existing {
+        let place = match existing {
             Some(existing) => existing,
-            None => (
-                RunFolder::create(args.run_dir.as_deref(), args.name.as_deref())?,
-                false,
-            ),
+            None => RunFolder::create(args.run_dir.as_deref(), args.name.as_deref())?,
         };
-        let saver = Saver::new(
-            place,
-            args,
-            &session.config,
-            session.checkpoint(),
-            from_newest,
-        );
+        let saver = Saver::new(place, args, &session.config, session.checkpoint());
         Ok((session, saver))
     }
 

@@ -12,7 +12,7 @@ use crate::agent::expect_states;
 use crate::cli::TrainArgs;
 use crate::config::{Config, MODEL, Override, PpoConfig, Reader, Settings, Source, short};
 use crate::load::{self, PolicySource};
-use crate::os::{self, Locked};
+use crate::os::Locked;
 use crate::ppo::{Checkpoint, Fork};
 use crate::ranks::Exchange;
 use crate::repose::{Record, Task};
@@ -43,8 +43,8 @@ pub enum Takes {
     Fork,
 }
 
-/// The folder of a run that is resumed, the lock on it, and whether the checkpoint that is resumed is the newest one.
-pub type Existing = ((RunFolder, Locked), bool);
+/// The folder of a run that is resumed, and the lock on it.
+pub type Existing = (RunFolder, Locked);
 
 /// The parts of a plan as they are sent: the settings as text, the checkpoint as a file.
 type PlanParts = (
@@ -123,15 +123,13 @@ impl Plan {
         let place = place.context(
             "--resume: there is no run in runs/shadow-hand-repose; name the folder of a run",
         )?;
-        let folder = RunFolder::containing(&place)?;
-        let checkpoints = &folder.checkpoints;
+        let mut folder = RunFolder::containing(&place)?;
         ensure!(
-            !checkpoints.newest_first().is_empty(),
+            !folder.checkpoints.newest_first().is_empty(),
             "{} holds no checkpoint: the run ended before it saved one; repeat the command that started it",
             place.display()
         );
         let lock = folder.lock()?;
-        let newest = checkpoints.newest_first();
         let (path, checkpoint) = load::newest_sound(|| checkpoints_at(&place))
             .with_context(|| format!("cannot resume {}", place.display()))?;
         let context = format!("cannot resume from {}", path.display());
@@ -148,7 +146,6 @@ impl Plan {
         // The best evaluation comes from the folder. It may have been saved after the checkpoint that is resumed, and a worse
         // one must not replace it.
         let best = best_so_far(&folder, checkpoint.progress.best);
-        let from_newest = os::same_file(&path, &newest[0]);
         let from = Some((Takes::State, checkpoint));
         let plan = Self {
             from,
@@ -156,7 +153,7 @@ impl Plan {
             context: Some(context),
             ..Self::new(config, args)?
         };
-        Ok((plan, ((folder, lock), from_newest)))
+        Ok((plan, (folder, lock)))
     }
 
     /// Plans a new run that starts from the newest undamaged checkpoint of another, or from the given one. Settings may

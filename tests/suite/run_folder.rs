@@ -5,7 +5,8 @@ use std::path::Path;
 use std::process::{Command, Output};
 use std::time::{Duration, Instant};
 
-use crate::support::{command, must_be_possible, names, program, stderr, succeeded, train};
+use crate::resume::everything;
+use crate::support::{command, metrics, names, preloaded, program, stderr, succeeded, train};
 use crate::survival::{begun, ended_by, endless, iterations, result, resume, send};
 
 #[test]
@@ -92,10 +93,10 @@ fn a_damaged_checkpoint_is_reported_and_the_one_before_is_used() {
     );
 }
 
-#[test]
-fn a_training_whose_folder_was_given_to_another_one_keeps_out_of_it() {
-    let folder = tempfile::tempdir().unwrap();
-    fs::create_dir(folder.path().join("tmp")).unwrap();
+/// Begins a training without end in `run`, and exchanges what lies there while it is suspended. Returns its exit code and what it said
+/// after one more checkpoint.
+fn exchanged_meanwhile(folder: &Path, exchange: impl FnOnce(&Path)) -> (Option<i32>, String) {
+    fs::create_dir(folder.join("tmp")).unwrap();
     let args = train(&[
         "--total-steps",
         "100000000",
@@ -104,19 +105,86 @@ fn a_training_whose_folder_was_given_to_another_one_keeps_out_of_it() {
         "--set",
         "run.checkpoint_every=1",
     ]);
-    let mut first = command(folder.path(), &args);
-    first.env("TMPDIR", folder.path().join("tmp"));
-    let (first, first_lines) = begun(first);
-    send("STOP", &first);
-    fs::rename(folder.path().join("run"), folder.path().join("gone")).unwrap();
-    let (second, second_lines) = begun(command(folder.path(), &args));
-    send("CONT", &first);
-    let (code, said) = ended_by("TERM", first, first_lines);
-    assert_eq!(code, Some(1), "{said}");
-    assert!(
-        said.contains("is in use by another program") && said.contains("instead"),
+    let mut training = command(folder, &args);
+    training.env("TMPDIR", folder.join("tmp"));
+    let (child, lines) = begun(training);
+    send("STOP", &child);
+    exchange(folder);
+    send("CONT", &child);
+    std::thread::sleep(Duration::from_millis(500));
+    ended_by("TERM", child, lines)
+}
+
+#[test]
+fn a_training_whose_folder_was_moved_goes_on_there_and_leaves_what_has_its_place_as_it_is() {
+    let folder = tempfile::tempdir().unwrap();
+    let args = train(&["--total-steps", "256", "--run-dir", "finished"]);
+    succeeded(program(folder.path(), &args));
+    let before = everything(&folder.path().join("finished"));
+    let (code, said) = exchanged_meanwhile(folder.path(), |folder| {
+        fs::rename(folder.join("run"), folder.join("moved")).unwrap();
+        fs::rename(folder.join("finished"), folder.join("run")).unwrap();
+    });
+    assert_eq!(code, Some(143), "{said}");
+    assert_eq!(
+        said.matches("the run folder was moved").count(),
+        1,
         "{said}"
     );
+    assert!(
+        said.contains("--resume") && said.contains("/moved"),
+        "{said}"
+    );
+    assert!(everything(&folder.path().join("run")) == before);
+    let moved = folder.path().join("moved");
+    let rows = |run: &Path| metrics(run).len() as u64 - 1;
+    let made = rows(&moved);
+    let steps = ((made + 1) * 128).to_string();
+    let args = ["train", "--resume", "moved", "--total-steps", &steps];
+    let said = stderr(&succeeded(program(folder.path(), &args)));
+    assert!(
+        !said.contains("lacks") && !said.contains("dropped"),
+        "{said}"
+    );
+    assert_eq!(rows(&moved), made + 1);
+}
+
+#[test]
+fn a_training_whose_checkpoints_were_exchanged_goes_on_with_its_own() {
+    let folder = tempfile::tempdir().unwrap();
+    let args = train(&["--total-steps", "256", "--run-dir", "finished"]);
+    succeeded(program(folder.path(), &args));
+    let before = everything(&folder.path().join("finished/checkpoints"));
+    let (code, said) = exchanged_meanwhile(folder.path(), |folder| {
+        fs::rename(folder.join("run/checkpoints"), folder.join("own")).unwrap();
+        fs::rename(
+            folder.join("finished/checkpoints"),
+            folder.join("run/checkpoints"),
+        )
+        .unwrap();
+    });
+    assert_eq!(code, Some(143), "{said}");
+    assert!(said.contains("its checkpoints lie in"), "{said}");
+    assert!(everything(&folder.path().join("run/checkpoints")) == before);
+    let made = metrics(&folder.path().join("run")).len() - 1;
+    let newest = format!("iteration-{made:08}.safetensors");
+    assert!(names(&folder.path().join("own")).contains(&newest));
+}
+
+#[test]
+fn a_training_whose_folder_was_given_to_another_one_keeps_out_of_it() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut second = None;
+    let (code, said) = exchanged_meanwhile(folder.path(), |folder| {
+        fs::remove_dir_all(folder.join("run")).unwrap();
+        second = Some(endless(folder, &[]));
+    });
+    assert_eq!(code, Some(1), "{said}");
+    assert!(
+        said.contains("exists") && said.contains("instead; resume with"),
+        "{said}"
+    );
+    let (second, second_lines) = second.unwrap();
     assert_eq!(ended_by("TERM", second, second_lines).0, Some(143));
     let made = iterations(folder.path());
     succeeded(resume(
@@ -175,20 +243,96 @@ fn two_trainings_in_one_folder_are_refused_and_a_crash_leaves_no_lock() {
     succeeded(resume(folder.path(), &["--total-steps", "128"]));
 }
 
-/// Compiles a library that makes file locks fail, as on a file system without them.
+/// A library that makes file locks fail, as on a file system without them.
 fn without_locks(folder: &Path) -> Option<String> {
-    let (source, library) = (folder.join("no_locks.c"), folder.join("no_locks.so"));
-    let text = "#include <errno.h>\nint flock(int f, int o) { (void)f; (void)o; errno = ENOLCK; return -1; }\n";
-    fs::write(&source, text).unwrap();
-    let compiled = Command::new("cc")
-        .args(["-shared", "-fPIC", "-o"])
-        .args([&library, &source])
-        .status();
-    if !compiled.is_ok_and(|status| status.success()) {
-        must_be_possible("a file system without locks: there is no C compiler");
-        return None;
+    preloaded(
+        folder,
+        "#include <errno.h>\nint flock(int f, int o) { (void)f; (void)o; errno = ENOLCK; return -1; }\n",
+    )
+}
+
+/// Refuses whatever else is done to a file than to write, read, rename and remove it, as some file systems do.
+const WITHOUT_NICETIES: &str = "#define _GNU_SOURCE\n#include <dlfcn.h>\n#include <errno.h>\n#include <sys/stat.h>\n\
+    #define REFUSED(name, ...) int name(__VA_ARGS__) { errno = EPERM; return -1; }\n\
+    REFUSED(fchmod, int f, mode_t m)\nREFUSED(chmod, const char *p, mode_t m)\nREFUSED(flock, int f, int o)\n\
+    REFUSED(link, const char *a, const char *b)\nREFUSED(linkat, int a, const char *b, int c, const char *d, int e)\n\
+    REFUSED(fchown, int f, int u, int g)\nREFUSED(futimens, int f, const struct timespec *t)\n\
+    int fsync(int f) { errno = EINVAL; return -1; }\nint fdatasync(int f) { errno = EINVAL; return -1; }\n";
+
+#[test]
+fn where_a_file_system_refuses_modes_locks_links_and_syncs_every_checkpoint_is_kept() {
+    let folder = tempfile::tempdir().unwrap();
+    let Some(library) = preloaded(folder.path(), WITHOUT_NICETIES) else {
+        return;
+    };
+    let run = |args: &[&str]| {
+        let mut command = command(folder.path(), args);
+        command.env("LD_PRELOAD", &library);
+        succeeded(command.output().unwrap())
+    };
+    let every = ["--set", "run.checkpoint_every=1", "--run-dir", "run"];
+    let said = run(&train(&[&["--total-steps", "256"][..], &every].concat()));
+    assert!(!stderr(&said).contains("warning"), "{}", stderr(&said));
+    run(&["train", "--resume", "run", "--total-steps", "512"]);
+    for _ in 0..2 {
+        run(&["export", "--ckpt", "run", "--out", "p.onnx"]);
+        run(&[
+            "play",
+            "--ckpt",
+            "run",
+            "--episodes",
+            "1",
+            "--out",
+            "p.html",
+        ]);
     }
-    Some(library.display().to_string())
+    let checkpoints = names(&folder.path().join("run/checkpoints"));
+    assert!(checkpoints.contains(&"iteration-00000004.safetensors".to_owned()));
+    let plain = train(&["--total-steps", "512", "--run-dir", "plain"]);
+    succeeded(program(folder.path(), &plain));
+    assert_eq!(
+        result(folder.path(), "run").2,
+        result(folder.path(), "plain").2
+    );
+}
+
+#[test]
+fn a_training_that_was_suspended_where_there_are_no_locks_looks_again_before_it_writes() {
+    let folder = tempfile::tempdir().unwrap();
+    let Some(library) = without_locks(folder.path()) else {
+        return;
+    };
+    fs::create_dir(folder.path().join("tmp")).unwrap();
+    let run = |args: &[&str]| {
+        let mut command = command(folder.path(), args);
+        command
+            .env("LD_PRELOAD", &library)
+            .env("TMPDIR", folder.path().join("tmp"));
+        command
+    };
+    let args = train(&["--total-steps", "100000000", "--run-dir", "run"]);
+    let (first, first_lines) = begun(run(&args));
+    send("STOP", &first);
+    let (second, second_lines) = begun(run(&["train", "--resume", "run"]));
+    send("CONT", &first);
+    let said: Vec<String> = first_lines.map_while(|line| line.ok()).collect();
+    let said = said.join("\n");
+    assert!(
+        said.contains("is in use by another program") && said.contains("instead; resume with"),
+        "{said}"
+    );
+    let mut first = first;
+    assert_eq!(first.wait().unwrap().code(), Some(1));
+    assert_eq!(ended_by("TERM", second, second_lines).0, Some(143));
+    let iterations: Vec<String> = metrics(&folder.path().join("run"))
+        .into_iter()
+        .map(|row| row[0].clone())
+        .collect();
+    let expected = (1..iterations.len()).map(|number| number.to_string());
+    assert!(
+        iterations[1..].iter().cloned().eq(expected),
+        "{iterations:?}"
+    );
 }
 
 #[test]
@@ -222,7 +366,7 @@ fn where_there_are_no_locks_a_second_training_is_kept_out_as_well() {
     );
     let said = stderr(&third);
     assert!(
-        said.contains("is finished") || said.contains("there are no file locks in run"),
+        said.contains("is finished") || said.contains("there are no file locks in "),
         "{said}"
     );
 }
@@ -352,12 +496,13 @@ fn a_state_that_cannot_be_saved_in_its_place_in_the_end_is_saved_elsewhere() {
         .display()
         .to_string();
     assert!(
-        said.contains(&format!("--resume {elsewhere}")) && said.contains("error: cannot create"),
+        said.contains(&format!("--resume {elsewhere}"))
+            && said.contains("error: cannot create the folder run/checkpoints"),
         "{said}"
     );
     let resumed = program(
         folder.path(),
-        &["train", "--resume", &elsewhere, "--stop-after", "300ms"],
+        &["train", "--resume", &elsewhere, "--stop-after", "2s"],
     );
     assert!(stderr(&succeeded(resumed)).contains("stopped after"));
 }
@@ -483,19 +628,16 @@ fn a_file_tells_scripts_whether_a_training_is_to_be_continued() {
 #[test]
 fn a_link_that_takes_the_place_of_the_checkpoints_is_not_followed() {
     let folder = tempfile::tempdir().unwrap();
-    let (child, lines) = endless(folder.path(), &[]);
-    let run = folder.path().join("run");
-    fs::create_dir(folder.path().join("victim")).unwrap();
-    fs::rename(run.join("checkpoints"), run.join("old")).unwrap();
-    std::os::unix::fs::symlink("../victim", run.join("checkpoints")).unwrap();
-    let (code, said) = ended_by("TERM", child, lines);
-    assert!(
-        said.contains("links in a run folder are not followed") && said.contains("is in "),
-        "{said}"
-    );
+    let (code, said) = exchanged_meanwhile(folder.path(), |folder| {
+        let run = folder.join("run");
+        fs::create_dir(folder.join("victim")).unwrap();
+        fs::rename(run.join("checkpoints"), run.join("old")).unwrap();
+        std::os::unix::fs::symlink("../victim", run.join("checkpoints")).unwrap();
+    });
+    assert!(said.contains("/old"), "{said}");
     assert_eq!(
         (code, names(&folder.path().join("victim")).len()),
-        (Some(1), 0)
+        (Some(143), 0)
     );
 }
 

@@ -80,6 +80,21 @@ pub(crate) fn command(folder: &Path, args: &[&str]) -> Command {
     command
 }
 
+/// Compiles a library from this C code, for `LD_PRELOAD`. It stands for a system that behaves so. Returns `None` without a compiler.
+pub(crate) fn preloaded(folder: &Path, code: &str) -> Option<String> {
+    let (source, library) = (folder.join("preloaded.c"), folder.join("preloaded.so"));
+    fs::write(&source, code).unwrap();
+    let compiled = Command::new("cc")
+        .args(["-shared", "-fPIC", "-o"])
+        .args([&library, &source])
+        .status();
+    if compiled.is_ok_and(|status| status.success()) {
+        return Some(library.display().to_string());
+    }
+    must_be_possible("a library that is preloaded: there is no C compiler");
+    None
+}
+
 /// Returns the arguments of `train` with the settings of [`SMALL`] and `more` arguments.
 pub(crate) fn train<'a>(more: &[&'a str]) -> Vec<&'a str> {
     let mut args = vec!["train"];

@@ -11,7 +11,7 @@ use shadow_repose::rng;
 use shadow_repose::sim::{Compilation, Cone, Scene, Simulation};
 
 use crate::support::{
-    SCENE, command, events, metrics, names, program, stderr, succeeded, train, weights,
+    SCENE, command, events, metrics, names, preloaded, program, stderr, succeeded, train, weights,
 };
 
 /// The result of a run: weights, optimizer and environments of its latest checkpoint, its policy, its metrics, its score.
@@ -329,18 +329,17 @@ fn ignored(signal: u32) -> bool {
 #[test]
 fn a_second_signal_ends_the_program_at_once_and_one_that_follows_the_first_immediately_does_not() {
     let folder = tempfile::tempdir().unwrap();
-    // Nobody reads its messages any more, and the pipe is full: the training waits at its next message, until a signal ends it.
-    let (reader, mut writer) = std::io::pipe().unwrap();
+    // A disk that hangs from some moment on: the training waits for its last checkpoint.
+    let hanging = "#include <unistd.h>\n\
+        int fsync(int f) { (void)f; while (access(\"hangs\", 0) == 0) usleep(1000); return 0; }\n";
+    let Some(library) = preloaded(folder.path(), hanging) else {
+        return;
+    };
     let args = train(&["--total-steps", "100000000", "--run-dir", "run"]);
-    let mut child = command(folder.path(), &args)
-        .stderr(writer.try_clone().unwrap())
-        .spawn()
-        .unwrap();
-    kill_after_five_minutes(&child);
-    let mut lines = BufReader::new(reader).lines();
-    while !lines.next().unwrap().unwrap().contains("run folder") {}
-    std::thread::spawn(move || while writer.write_all(&[b'\n'; 4096]).is_ok() {});
-    std::thread::sleep(Duration::from_millis(500));
+    let mut training = command(folder.path(), &args);
+    training.env("LD_PRELOAD", library);
+    let (mut child, _lines) = begun(training);
+    fs::write(folder.path().join("hangs"), "").unwrap();
     let twice = format!("kill -TERM {0}; kill -TERM {0}", child.id());
     assert!(
         Command::new("sh")
@@ -363,6 +362,56 @@ fn a_second_signal_ends_the_program_at_once_and_one_that_follows_the_first_immed
         "{:?}",
         asked.elapsed()
     );
+}
+
+#[test]
+fn a_training_goes_on_when_nobody_reads_what_it_says_and_saves_at_a_signal_or_a_file() {
+    let folder = tempfile::tempdir().unwrap();
+    let (reader, mut writer) = std::io::pipe().unwrap();
+    let more = ["--total-steps", "100000000", "--run-dir", "run"];
+    let args = train(&more);
+    let run = folder.path().join("run");
+    let mut child = command(folder.path(), &args)
+        .stderr(writer.try_clone().unwrap())
+        .stdout(writer.try_clone().unwrap())
+        .spawn()
+        .unwrap();
+    kill_after_five_minutes(&child);
+    let mut lines = BufReader::new(reader).lines();
+    while !lines.next().unwrap().unwrap().contains("steps/s") {}
+    // The pipe is full, and nobody reads it any more.
+    std::thread::spawn(move || while writer.write_all(&[b'\n'; 4096]).is_ok() {});
+    std::thread::sleep(Duration::from_millis(500));
+    for stop in ["file", "TERM"] {
+        let before = iterations(folder.path());
+        // Each iteration says the score of an evaluation.
+        let patience = Instant::now();
+        while iterations(folder.path()) < before + 3 {
+            assert!(patience.elapsed() < Duration::from_secs(60), "it waits");
+            std::thread::sleep(Duration::from_millis(20));
+        }
+        let asked = Instant::now();
+        match stop {
+            "file" => fs::write(run.join("stop"), "").unwrap(),
+            signal => send(signal, &child),
+        }
+        let code = if stop == "file" { 0 } else { 143 };
+        assert_eq!(child.wait().unwrap().code(), Some(code), "{stop}");
+        assert!(asked.elapsed() < Duration::from_secs(10), "{stop}");
+        let newest = format!("iteration-{:08}.safetensors", iterations(folder.path()));
+        assert!(names(&run.join("checkpoints")).contains(&newest), "{stop}");
+        let (reader, writer) = std::io::pipe().unwrap();
+        let mut filled = writer.try_clone().unwrap();
+        std::thread::spawn(move || while filled.write_all(&[b'\n'; 4096]).is_ok() {});
+        std::mem::forget(reader);
+        child = command(folder.path(), &["train", "--resume", "run"])
+            .stderr(writer)
+            .spawn()
+            .unwrap();
+        kill_after_five_minutes(&child);
+    }
+    child.kill().unwrap();
+    child.wait().unwrap();
 }
 
 #[test]

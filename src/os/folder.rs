@@ -1,0 +1,132 @@
+//! A folder that is held open, so that its files are found wherever it is moved.
+
+use std::fs::{self, File};
+use std::os::fd::AsRawFd;
+use std::os::unix::fs::MetadataExt;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use anyhow::Result;
+
+use super::file::{Cannot, expect_named};
+
+/// Where the system lists the handles of this process. A path through one of them leads to what is open, whatever its name is.
+const HANDLES: &str = "/proc/self/fd";
+
+/// A folder that is known by its name or, once it is held, by a handle. Then its files are reached even after it was renamed, and
+/// what has taken its name is not.
+#[derive(Clone, Debug)]
+pub struct Folder {
+    /// The path by which its files are reached.
+    pub path: PathBuf,
+    /// The path at which it is opened or created.
+    pub name: PathBuf,
+    handle: Option<Arc<File>>,
+}
+
+impl Folder {
+    /// The folder with this name, which need not exist.
+    pub fn at(name: PathBuf) -> Self {
+        Self {
+            path: name.clone(),
+            name,
+            handle: None,
+        }
+    }
+
+    /// Creates the folder unless it exists, and opens it. A held folder that was deleted is created again.
+    ///
+    /// # Errors
+    /// Fails if it cannot be created or opened, or if something else has the name of a deleted one.
+    pub fn hold(&mut self) -> Result<()> {
+        let created = match &self.handle {
+            Some(handle) if self.leads_to(handle) => return Ok(()),
+            Some(_) => fs::create_dir(&self.name),
+            None => fs::create_dir_all(&self.name),
+        };
+        created.cannot("create the folder", &self.name)?;
+        let handle = File::open(&self.name).cannot("open", &self.name)?;
+        self.path = Path::new(HANDLES).join(handle.as_raw_fd().to_string());
+        // Where the system lists no handles, the name must do.
+        if !self.leads_to(&handle) {
+            self.path.clone_from(&self.name);
+        }
+        self.handle = Some(Arc::new(handle));
+        Ok(())
+    }
+
+    /// Whether the path leads to this open folder, and the folder was not deleted.
+    fn leads_to(&self, handle: &File) -> bool {
+        let exists = handle.metadata().is_ok_and(|facts| facts.nlink() > 0);
+        exists && expect_named(&self.path, handle).is_ok()
+    }
+
+    /// The path where the folder lies now: its name, unless it was moved.
+    pub fn place(&self) -> PathBuf {
+        match &self.handle {
+            Some(handle) if expect_named(&self.name, handle).is_err() => {
+                fs::read_link(&self.path).unwrap_or_else(|_| self.name.clone())
+            }
+            _ => self.name.clone(),
+        }
+    }
+}
+
+/// A path for a message: one that leads through a handle is given as it would be without, from the working folder if it lies there.
+pub fn shown(path: &Path) -> PathBuf {
+    let through = || {
+        let mut parts = path.strip_prefix(HANDLES).ok()?.components();
+        let folder = fs::read_link(Path::new(HANDLES).join(parts.next()?)).ok()?;
+        let whole = folder.join(parts.as_path());
+        let here = std::env::current_dir().unwrap_or_default();
+        Some(
+            whole
+                .strip_prefix(here)
+                .map(Path::to_owned)
+                .unwrap_or(whole),
+        )
+    };
+    through().unwrap_or_else(|| path.to_owned())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn held(name: PathBuf) -> Folder {
+        let mut folder = Folder::at(name);
+        folder.hold().unwrap();
+        folder
+    }
+
+    #[test]
+    fn a_folder_that_was_moved_is_written_where_it_lies_and_what_has_its_name_is_not() {
+        let place = tempfile::tempdir().unwrap();
+        let [name, moved] = ["run", "moved"].map(|name| place.path().join(name));
+        let mut folder = held(name.clone());
+        assert_eq!(folder.place(), name);
+        fs::rename(&name, &moved).unwrap();
+        fs::create_dir(&name).unwrap();
+        fs::write(folder.path.join("file"), "").unwrap();
+        assert!(moved.join("file").exists() && !name.join("file").exists());
+        assert_eq!(folder.place(), moved);
+        assert_eq!(shown(&folder.path.join("file")), moved.join("file"));
+        folder.hold().unwrap();
+        assert_eq!(folder.place(), moved, "it is held as before");
+    }
+
+    #[test]
+    fn a_folder_that_was_deleted_is_created_again_only_where_nothing_has_its_name() {
+        let place = tempfile::tempdir().unwrap();
+        let name = place.path().join("run");
+        let mut folder = held(name.clone());
+        fs::remove_dir(&name).unwrap();
+        fs::write(&name, "of another").unwrap();
+        let refusal = format!("{:#}", folder.hold().unwrap_err());
+        assert!(refusal.contains("exists"), "{refusal}");
+        fs::remove_file(&name).unwrap();
+        folder.hold().unwrap();
+        fs::write(folder.path.join("file"), "").unwrap();
+        assert!(name.join("file").exists());
+    }
+}
