@@ -146,15 +146,15 @@ impl Checkpoints {
     }
 }
 
-/// Checks that a folder that is about to be written into is no link: a run folder may have been changed since the training run began.
+/// Checks that what is about to be written into is no link: a run folder may have been changed since the training run began.
 ///
 /// # Errors
 /// Fails if it is.
-pub fn expect_no_link(folder: &Path) -> Result<()> {
+pub fn expect_no_link(path: &Path) -> Result<()> {
     ensure!(
-        !folder.is_symlink(),
+        !path.is_symlink(),
         "cannot write {}: links in a run folder are not followed",
-        shown(folder).display()
+        shown(path).display()
     );
     Ok(())
 }

@@ -178,7 +178,10 @@ pub fn cut_off_after(folder: &Path, last_step: u64) -> Result<()> {
 pub fn event_files(folder: &Path) -> Result<Vec<(u64, PathBuf)>> {
     let [begin, end] = NAME;
     let entries = fs::read_dir(folder).cannot("read", folder)?;
-    let ours = entries.flatten().filter_map(|entry| {
+    let files = entries
+        .flatten()
+        .filter(|entry| entry.file_type().is_ok_and(|kind| kind.is_file()));
+    let ours = files.filter_map(|entry| {
         let name = entry.file_name();
         let (seconds, _) = name
             .to_str()?

@@ -15,6 +15,7 @@ use tensorboard_proto::tensor::TensorProto;
 use tensorboard_proto::types::DataType;
 use toml::{Table, Value};
 
+use super::checkpoints::expect_no_link;
 use super::events::{EventFile, event_files, now};
 use super::summary::{Descriptions, with_metadata};
 use crate::os::Cannot;
@@ -31,6 +32,7 @@ const TENSOR: u32 = 2;
 /// Fails if its file cannot be written.
 pub fn begin(folder: &Path, step: u64, settings: &Table) -> Result<EventFile> {
     let folder = folder.join(HPARAMS);
+    expect_no_link(&folder)?;
     if !folder.exists() {
         fs::create_dir(&folder).cannot("create", &folder)?;
     }

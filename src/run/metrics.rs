@@ -9,6 +9,7 @@ use std::path::{Path, PathBuf};
 
 use anyhow::Result;
 
+use super::checkpoints::expect_no_link;
 use super::folder::METRICS;
 use crate::os::{Cannot, expect_named, make_own, put_aside, shown, sync, sync_folder};
 
@@ -35,6 +36,7 @@ impl Metrics {
         iterations: Range<u64>,
         mut tell: impl FnMut(&str),
     ) -> Result<Self> {
+        expect_no_link(path)?;
         let found = match File::open(path) {
             Err(error) if error.kind() == ErrorKind::NotFound => Some(Rows::default()),
             file => file

@@ -333,12 +333,26 @@ mod tests {
     }
 
     #[test]
-    fn a_full_disk_is_a_warning() {
+    fn a_link_that_takes_the_place_of_a_log_is_not_written_through() {
         let place = tempfile::tempdir().unwrap();
-        std::os::unix::fs::symlink("/dev/full", place.path().join(METRICS)).unwrap();
-        let mut report = open(place.path(), &["a"], 0, 0);
-        report.iteration(1, &[("a", 1.0)], &[], &status(10));
+        let [run, other] = ["run", "other"].map(|name| place.path().join(name));
+        drop(open_in(&other));
+        let mut report = open_in(&run);
+        let kept = fs::read(other.join(METRICS)).unwrap();
+        for name in [METRICS, HPARAMS] {
+            let own = run.join(name);
+            fs::rename(&own, place.path().join(name)).unwrap();
+            std::os::unix::fs::symlink(other.join(name), own).unwrap();
+        }
         report.sync();
+        report.iteration(1, &[("a", 1.0)], &[], &status(10));
         assert_eq!((report.metrics.lost, report.events.lost), (1, 0));
+        assert_eq!(fs::read(other.join(METRICS)).unwrap(), kept);
+        assert_eq!(fs::read_dir(other.join(HPARAMS)).unwrap().count(), 1);
+    }
+
+    fn open_in(folder: &Path) -> Report {
+        fs::create_dir(folder).unwrap();
+        open(folder, &["a"], 0, 0)
     }
 }
