@@ -3,7 +3,6 @@
 #[cfg(all(target_os = "linux", target_arch = "x86_64"))]
 mod processor;
 
-use std::io::ErrorKind;
 use std::process::ExitCode;
 
 use shadow_repose::cli::{self, Command};
@@ -47,12 +46,23 @@ fn main() -> ExitCode {
 
 /// Prints the help, the version or a usage error, and returns the exit code. Among several ranks, only one prints.
 fn tell(answer: &clap::Error) -> ExitCode {
-    if ranks::is_spokesman()
-        && let Err(error) = answer.print()
-        && error.kind() != ErrorKind::BrokenPipe
-    {
-        os::say_line(&format!("error: cannot write to stdout: {error}"));
+    let code = ExitCode::from(answer.exit_code() as u8);
+    if !ranks::is_spokesman() {
+        return code;
+    }
+    if answer.use_stderr() {
+        let _ = answer.print();
+        return code;
+    }
+    let text = answer.render();
+    let text = if os::colors_enabled() {
+        text.ansi().to_string()
+    } else {
+        text.to_string()
+    };
+    if let Err(error) = os::print(&text) {
+        os::say_line(&format!("error: {error:#}"));
         return ExitCode::FAILURE;
     }
-    ExitCode::from(answer.exit_code() as u8)
+    code
 }

@@ -117,7 +117,9 @@ def test_python_runs_while_the_hands_step():
 
 
 def test_ctrl_c_interrupts_a_long_evaluation_soon_and_python_keeps_its_handler():
-    handler = signal.getsignal(signal.SIGINT)
+    handler = signal.default_int_handler
+    # A background job of some shells begins with the signal ignored.
+    signal.signal(signal.SIGINT, handler)
     timer = threading.Timer(0.5, lambda: os.kill(os.getpid(), signal.SIGINT))
     began = time.monotonic()
     timer.start()

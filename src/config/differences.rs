@@ -2,7 +2,7 @@
 
 use toml::{Table, Value};
 
-use super::overlay::{brief, settings};
+use super::overlay::{DEFAULTS, brief, lookup, settings};
 use super::ramp::Ramp;
 use super::settings::{BUILTIN_MODEL, Config, EnvConfig, RunConfig};
 
@@ -46,6 +46,17 @@ impl Config {
         let mut own = self.flat();
         own.retain(|key, _| !["run.threads", "run.shards"].contains(&key));
         own
+    }
+
+    /// The settings of [`dotted`](Self::dotted), each of one type in every run: what may be a ramp or a table is a text.
+    pub fn comparable(&self) -> Table {
+        let mut all = self.dotted();
+        for (key, value) in &mut all {
+            if lookup(&DEFAULTS, key).is_some_and(Value::is_table) {
+                *value = value.to_string().into();
+            }
+        }
+        all
     }
 
     /// The settings that change in the course of a run, by dotted key.
@@ -116,6 +127,41 @@ fn inner(value: &Value) -> String {
 mod tests {
     use super::*;
     use crate::config::Settings;
+
+    #[test]
+    fn a_setting_that_may_be_a_ramp_is_a_text_in_every_run_and_any_other_setting_keeps_its_type() {
+        let of = |sets: &[&str]| {
+            let sets: Vec<_> = sets.iter().map(|set| set.parse().unwrap()).collect();
+            let config = Settings::new().sets(&sets).resolve().unwrap();
+            config.comparable()
+        };
+        let all = |to: &str| {
+            let ramps = DEFAULTS.iter().flat_map(|(section, keys)| {
+                let ramps = keys.as_table().unwrap().iter();
+                let ramps = ramps.filter(|(_, value)| value.get("from").is_some());
+                ramps.map(move |(key, _)| format!("{section}.{key}"))
+            });
+            let sets: Vec<String> = ramps.map(|key| format!("{key}={to}")).collect();
+            of(&sets.iter().map(String::as_str).collect::<Vec<_>>())
+        };
+        let default = of(&[]);
+        let constant = all("1");
+        for other in [
+            &constant,
+            &all("{from=1,to=1,steps=7}"),
+            &of(&["env.noise={joint_pos=0.1}"]),
+        ] {
+            assert_eq!(other.len(), default.len());
+            for ((key, value), usual) in other.iter().zip(default.values()) {
+                assert!(value.same_type(usual), "{key}: {value} and {usual}");
+            }
+        }
+        assert_eq!(
+            of(&["training.tolerance=0.07"])["training.tolerance"].as_str(),
+            Some("0.07")
+        );
+        assert!(default["ppo.gamma"].is_float());
+    }
 
     #[test]
     fn what_makes_another_training_is_listed_in_the_form_of_an_option_that_sets_it() {

@@ -18,6 +18,7 @@ mod stderr;
 mod terminal;
 mod threads;
 
+pub use console::colors_enabled;
 pub use destination::Destination;
 pub use file::{Cannot, Stamp, expect_named, read_bytes, read_text, same_file, stamp};
 pub use folder::{Folder, shown};

@@ -1,8 +1,10 @@
 //! What the program says: on stdout, on stderr, and as commands for a shell.
 
-use std::io::{ErrorKind, IsTerminal, Write};
+use std::io::{BufWriter, Error, ErrorKind, IsTerminal, Write};
 use std::path::Path;
 use std::sync::OnceLock;
+use std::thread;
+use std::time::Duration;
 
 use anyhow::{Context, Result};
 
@@ -23,13 +25,17 @@ pub fn print(text: &str) -> Result<()> {
 pub fn is_read(text: &str) -> Result<bool> {
     // On a terminal, what was said before comes before.
     drain();
-    let mut stdout = std::io::stdout();
-    match stdout
-        .write_all(text.as_bytes())
-        .and_then(|()| stdout.flush())
-    {
-        Err(error) if error.kind() == ErrorKind::BrokenPipe => Ok(false),
-        written => written.map(|()| true).context("cannot write to stdout"),
+    // It keeps what has not been written yet.
+    let mut stdout = BufWriter::with_capacity(text.len() + 1, std::io::stdout());
+    stdout.write_all(text.as_bytes())?;
+    loop {
+        let written = stdout.flush();
+        match written.as_ref().map_err(Error::kind) {
+            // A pipe that does not block takes nothing for now.
+            Err(ErrorKind::WouldBlock) => thread::sleep(Duration::from_millis(5)),
+            Err(ErrorKind::BrokenPipe) => return Ok(false),
+            _ => return written.map(|()| true).context("cannot write to stdout"),
+        }
     }
 }
 

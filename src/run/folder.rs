@@ -261,7 +261,7 @@ impl RunFolder {
         let mut found = Vec::new();
         for name in ["", CHECKPOINTS, DIVERGED, HPARAMS] {
             let folder = self.path().join(name);
-            if !folder.exists() {
+            if !folder.is_dir() {
                 continue;
             }
             for entry in fs::read_dir(&folder).cannot("read", &folder)? {

@@ -54,18 +54,20 @@ impl Glance {
 }
 
 /// The folders in `folder`, or in the default folder of runs, which may be runs. Links to folders are left out. Someone who
-/// `waits` for the first run finds no folders where the default folder does not exist yet.
+/// `waits` for the first run finds no folders where the folder does not exist yet.
 ///
 /// # Errors
 /// Fails if the folder cannot be read.
 pub fn folders_of_runs(folder: Option<&Path>, waits: bool) -> Result<Vec<PathBuf>> {
     let path = folder.unwrap_or(Path::new(RUNS));
-    if folder.is_none() && !path.exists() {
+    if matches!(path.try_exists(), Ok(false)) {
+        if waits {
+            return Ok(Vec::new());
+        }
         ensure!(
-            waits,
+            folder.is_some(),
             "there are no runs in {RUNS}; begin one with `shadow-repose train`, or name another folder"
         );
-        return Ok(Vec::new());
     }
     let entries = fs::read_dir(path).cannot("read the folder", path)?;
     let is_folder = |entry: &fs::DirEntry| entry.file_type().is_ok_and(|kind| kind.is_dir());

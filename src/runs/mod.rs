@@ -91,7 +91,10 @@ fn read(args: &RunsArgs, default: &Config, before: &[Run]) -> Result<Vec<Run>> {
         [] => all(None)?,
         [place] if Glance::of(place).is_none() => all(Some(place))?,
         places => {
-            let runs = places.iter().map(|place| {
+            let expected = places
+                .iter()
+                .filter(|place| !args.watch || Glance::of(place).is_some());
+            let runs = expected.map(|place| {
                 ensure!(place.exists(), "{}: no such folder", place.display());
                 let no_run = || {
                     format!(

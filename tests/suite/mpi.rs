@@ -46,6 +46,7 @@ fn mpi() -> Option<Mpi> {
 impl Mpi {
     /// Returns the command that runs the program on this number of ranks in `folder`.
     fn command(&self, folder: &Path, ranks: usize, args: &[&str]) -> Command {
+        crate::support::obeying_signals();
         let mut command = Command::new(&self.launcher);
         command
             .current_dir(folder)

@@ -8,7 +8,9 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};
 use std::time::{Duration, Instant};
 
-use crate::support::{SCENE, command, must_be_possible, names, program, stderr, succeeded, train};
+use crate::support::{
+    SCENE, command, must_be_possible, names, obeying_signals, program, stderr, succeeded, train,
+};
 
 /// The arguments for very short episodes.
 const SHORT: [&str; 6] = [
@@ -199,6 +201,7 @@ fn as_the_first_process_of_a_container_it_ends_with_128_and_the_number_of_the_si
         must_be_possible("a container: unshare is missing or not permitted");
         return;
     };
+    obeying_signals();
     let place = tempfile::tempdir().unwrap();
     let folder = place.path();
     for (signal, code) in [("TERM", 143), ("INT", 130), ("HUP", 129)] {
@@ -232,6 +235,40 @@ fn as_the_first_process_of_a_container_it_ends_with_128_and_the_number_of_the_si
         );
         assert_eq!(unshare.wait().unwrap().code(), Some(code), "{signal}");
         assert_eq!(names(folder), [""; 0], "{signal}");
+    }
+}
+
+#[test]
+fn a_pipe_that_does_not_block_and_is_read_slowly_gets_all_data() {
+    let place = tempfile::tempdir().unwrap();
+    // F_SETPIPE_SZ makes the pipe small.
+    let script = "import fcntl, os, subprocess, sys, time\n\
+        read, write = os.pipe()\n\
+        fcntl.fcntl(write, 1031, 4096)\n\
+        os.set_blocking(write, False)\n\
+        child = subprocess.Popen(sys.argv[1:], stdout=write)\n\
+        os.close(write)\n\
+        while part := os.read(read, 4096):\n    \
+            sys.stdout.buffer.write(part)\n    \
+            time.sleep(0.02)\n\
+        sys.exit(child.wait())\n";
+    for args in [
+        &["man"][..],
+        &["completions", "fish"],
+        &["train", "--help"],
+        &["runs", "--help"],
+    ] {
+        let mut python = Command::new("python3");
+        python
+            .args(["-c", script, env!("CARGO_BIN_EXE_shadow-repose")])
+            .args(args)
+            .current_dir(place.path());
+        let Ok(slow) = python.output() else {
+            eprintln!("not tested: python3 is missing");
+            return;
+        };
+        let whole = succeeded(program(place.path(), args)).stdout;
+        assert!(succeeded(slow).stdout == whole, "{args:?}");
     }
 }
 

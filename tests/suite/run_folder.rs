@@ -666,4 +666,14 @@ fn a_run_is_a_row_for_hparams_with_its_best_goals_and_ends_when_all_steps_are_ma
     ));
     assert_eq!(tags(), [&start[..], &metrics, &end].concat());
     assert_eq!(names(&folder.join("run/hparams")).len(), 1);
+    // A file of that name is the user's, and the row is a nicety.
+    fs::remove_dir_all(folder.join("run/hparams")).unwrap();
+    fs::write(folder.join("run/hparams"), "mine").unwrap();
+    let more = ["train", "--resume", "run", "--total-steps", "512"];
+    let said = stderr(&succeeded(program(folder, &more)));
+    assert!(said.contains("logging to hparams is suspended"), "{said}");
+    assert_eq!(
+        fs::read_to_string(folder.join("run/hparams")).unwrap(),
+        "mine"
+    );
 }

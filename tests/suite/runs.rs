@@ -399,3 +399,34 @@ fn a_table_that_is_watched_waits_for_the_first_run() {
     send("INT", &child);
     assert!(!child.wait().unwrap().success());
 }
+
+#[test]
+fn folders_and_runs_that_are_named_are_waited_for_too() {
+    let place = tempfile::tempdir().unwrap();
+    let begin = |name: &str| {
+        let run = place.path().join(name);
+        fs::create_dir_all(&run).unwrap();
+        fs::write(run.join("metrics.csv"), "env_steps\n1\n").unwrap();
+    };
+    for (args, first, then) in [
+        (&["notyet"][..], None, "notyet/first"),
+        (&["one", "two"], Some("one"), "two"),
+    ] {
+        first.into_iter().for_each(begin);
+        let mut child = command(place.path(), &[&["runs", "--watch"], args].concat())
+            .stdout(Stdio::piped())
+            .spawn()
+            .unwrap();
+        let mut lines = BufReader::new(child.stdout.take().unwrap())
+            .lines()
+            .map_while(Result::ok);
+        assert!(lines.next().unwrap().starts_with("run "));
+        begin(then);
+        let name = then.rsplit('/').next().unwrap();
+        assert!(lines.any(|line| line.contains(name)), "{args:?}");
+        send("INT", &child);
+        child.wait().unwrap();
+    }
+    let unwatched = program(place.path(), &["runs", "never"]);
+    assert_eq!(unwatched.status.code(), Some(1));
+}

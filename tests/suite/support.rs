@@ -3,7 +3,7 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
-use std::sync::Arc;
+use std::sync::{Arc, Once};
 
 use shadow_repose::agent::Agent;
 use shadow_repose::config::{Config, EnvConfig, Override, Settings};
@@ -11,6 +11,7 @@ use shadow_repose::env::Env;
 use shadow_repose::ranks::Exchange;
 use shadow_repose::repose::{Repose, Task};
 use shadow_repose::rng;
+use signal_hook::consts::{SIGHUP, SIGINT, SIGQUIT, SIGTERM, SIGUSR1};
 
 /// The size of an observation of the built-in hand.
 pub(crate) const OBSERVATION_SIZE: usize = 157;
@@ -66,8 +67,28 @@ pub(crate) fn program(folder: &Path, args: &[&str]) -> Output {
     command(folder, args).output().expect("the program starts")
 }
 
+/// Has the programs that this process starts obey signals. A signal that is ignored here, as under `nohup` or in a background job,
+/// would be ignored by them. One that is caught here has its default effect on them.
+pub(crate) fn obeying_signals() {
+    static ONCE: Once = Once::new();
+    let ignored = |signal: i32| {
+        let status = fs::read_to_string("/proc/self/status").unwrap();
+        let mut lines = status.lines();
+        let mask = lines.find_map(|line| line.strip_prefix("SigIgn:")).unwrap();
+        u64::from_str_radix(mask.trim(), 16).unwrap() >> (signal - 1) & 1 == 1
+    };
+    ONCE.call_once(|| {
+        for signal in [SIGHUP, SIGINT, SIGQUIT, SIGTERM, SIGUSR1] {
+            if ignored(signal) {
+                signal_hook::flag::register(signal, Arc::default()).unwrap();
+            }
+        }
+    });
+}
+
 /// Returns the command that runs the program in `folder`.
 pub(crate) fn command(folder: &Path, args: &[&str]) -> Command {
+    obeying_signals();
     let mut command = Command::new(env!("CARGO_BIN_EXE_shadow-repose"));
     // Otherwise the window of a test would open on the user's own display.
     command
