@@ -25,6 +25,7 @@ fn main() -> ExitCode {
             .and_then(|requests| match command {
                 Command::Train(args) => train(&args, &requests),
                 Command::Play(args) => play::play(&args, &requests),
+                Command::View(args) if args.fetch => done(view::fetch()),
                 Command::View(args) => done(view::view(&args)),
                 Command::Export(args) => done(export::export(&args)),
                 Command::Plot(args) => done(plot::plot(&args)),
@@ -46,23 +47,19 @@ fn main() -> ExitCode {
 
 /// Prints the help, the version or a usage error, and returns the exit code. Among several ranks, only one prints.
 fn tell(answer: &clap::Error) -> ExitCode {
-    let code = ExitCode::from(answer.exit_code() as u8);
-    if !ranks::is_spokesman() {
-        return code;
-    }
-    if answer.use_stderr() {
+    if ranks::is_spokesman() && answer.use_stderr() {
         let _ = answer.print();
-        return code;
+    } else if ranks::is_spokesman() {
+        let text = answer.render();
+        let text = if os::colors_enabled() {
+            text.ansi().to_string()
+        } else {
+            text.to_string()
+        };
+        if let Err(error) = os::print(&text) {
+            os::say_line(&format!("error: {error:#}"));
+            return ExitCode::FAILURE;
+        }
     }
-    let text = answer.render();
-    let text = if os::colors_enabled() {
-        text.ansi().to_string()
-    } else {
-        text.to_string()
-    };
-    if let Err(error) = os::print(&text) {
-        os::say_line(&format!("error: {error:#}"));
-        return ExitCode::FAILURE;
-    }
-    code
+    ExitCode::from(answer.exit_code() as u8)
 }

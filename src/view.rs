@@ -14,7 +14,7 @@ use crate::evaluate::{Actor, Player};
 use crate::os::{self, say};
 use crate::repose::Task;
 use crate::see;
-use crate::sim::{Camera, Look};
+use crate::sim::Look;
 
 /// What to do where no window can be opened.
 const INSTEAD: &str =
@@ -27,7 +27,7 @@ const INSTEAD: &str =
 /// can be opened.
 pub fn view(args: &ViewArgs) -> Result<()> {
     expect_used(&args.settings.set, "view")?;
-    let made = match (&args.out, args.web) {
+    let made = match (&args.out, args.shot.web) {
         (Some(_), _) => Made::Picture,
         (None, Some(_)) => Made::Web,
         (None, None) => Made::Window,
@@ -42,7 +42,7 @@ pub fn view(args: &ViewArgs) -> Result<()> {
         Actor::without_policy(Path::new(&args.actions)).context("an actor for each motion")?;
     let look = args.shot.sized(args.size, args.quality);
     let load = || task_for_display(&config, &look);
-    match (&args.out, args.web) {
+    match (&args.out, args.shot.web) {
         #[cfg(not(feature = "video"))]
         (Some(_), _) => bail!(see::NO_FILMS),
         #[cfg(feature = "video")]
@@ -59,13 +59,21 @@ pub fn view(args: &ViewArgs) -> Result<()> {
             )?;
             say!("{}: {width}x{height}", to.path.display());
         }
-        (None, Some(port)) => show_on_page(port, &load()?, choice, args.seed, look.camera)?,
+        (None, Some(port)) => show_on_page(args, port, &load()?, choice)?,
         #[cfg(not(feature = "viewer"))]
         (None, None) => bail!("{}. {INSTEAD}", see::NO_WINDOWS),
         #[cfg(feature = "viewer")]
         (None, None) => show(&load()?, choice, args.seed)?,
     }
     Ok(())
+}
+
+/// Fetches the meshes of the hand.
+///
+/// # Errors
+/// Fails if they are not available.
+pub fn fetch() -> Result<()> {
+    os::hand_meshes(&see::mesh_files(), true).map(drop)
 }
 
 #[cfg(feature = "viewer")]
@@ -89,13 +97,7 @@ fn task_for_display(config: &Config, look: &Look) -> Result<Arc<Task>> {
 }
 
 /// Shows the scene on a page, with a slider for each actuator, for as long as the program runs.
-fn show_on_page(
-    port: u16,
-    task: &Arc<Task>,
-    choice: usize,
-    seed: u64,
-    camera: Option<Camera>,
-) -> Result<()> {
+fn show_on_page(args: &ViewArgs, port: u16, task: &Arc<Task>, choice: usize) -> Result<()> {
     let sliders = see::Sliders::new(task);
     let title = task
         .config
@@ -106,7 +108,7 @@ fn show_on_page(
     let about = see::About {
         title,
         policy: None,
-        seed: Some(seed),
+        seed: Some(args.seed),
     };
     let own = sliders.clone();
     let step = move |player: &mut Player| {
@@ -118,5 +120,7 @@ fn show_on_page(
         policy: None,
         task: task.clone(),
     };
-    see::Live::open(port, (&about, camera), 1, &acting, Some(sliders))?.show(&mut || acting.clone())
+    let place = (port, args.shot.web_host.as_deref());
+    let look = (&about, args.shot.camera);
+    see::Live::open(place, look, 1, &acting, Some(sliders))?.show(&mut || acting.clone())
 }

@@ -3,6 +3,7 @@
 const KEPT_SECONDS = 30;
 const MOST_BEHIND = 2000; // milliseconds
 const SILENCE = 5000;
+const LASTING = 10000;
 const LOST = "There is no connection to the program. It has ended, or it has too many viewers. The page tries again.";
 
 class Feed {
@@ -17,8 +18,9 @@ class Feed {
   open() {
     clearTimeout(this.retry);
     if (this.source || document.hidden) return;
-    const source = this.source = new EventSource("events");
-    [this.heard, this.best] = [performance.now(), Infinity];
+    const source = this.source = new EventSource(`events${location.search}`);
+    const begun = performance.now();
+    [this.heard, this.best] = [begun, Infinity];
     const on = (name, act) => source.addEventListener(name, (event) => {
       if (source !== this.source) return;
       this.heard = performance.now();
@@ -29,7 +31,12 @@ class Feed {
     on("controls", ({ data }) => showControls(JSON.parse(data)));
     on("beat", () => {});
     on("message", ({ data, lastEventId }) => this.take(data, Number(lastEventId)));
-    source.onerror = () => { if (source === this.source) this.again(LOST); };
+    source.onerror = () => {
+      if (source !== this.source) return;
+      if (performance.now() - begun < LASTING) return this.again(LOST);
+      this.close(); // Behind a proxy, no connection lasts.
+      this.open();
+    };
   }
 
   close() {
@@ -89,7 +96,7 @@ function makeSliders(sliders) {
     const body = JSON.stringify([...moved]);
     moved.clear();
     try {
-      const answer = await fetch("controls", { method: "POST", headers: { "Content-Type": "application/json" }, body });
+      const answer = await fetch(`controls${location.search}`, { method: "POST", headers: { "Content-Type": "application/json" }, body });
       if (!answer.ok) notice(`The program refused the new value: ${answer.status} ${answer.statusText}.`);
     } catch {
       notice("The new value did not reach the program.");

@@ -240,9 +240,6 @@ pub struct PlayArgs {
     /// Write the episodes of this trace as the .html of --out, without playing again
     #[arg(long, value_name = "FILE", help_heading = OUTPUT)]
     pub from_trace: Option<PathBuf>,
-    /// Show the hand in a browser while it plays, at this port of 127.0.0.1 (0: any free port) [default port: 7070]
-    #[arg(long, value_name = "PORT", num_args = 0..=1, default_missing_value = "7070", help_heading = OUTPUT)]
-    pub web: Option<u16>,
     /// Number of hands on the page of --web, at most 16
     #[arg(long, value_name = "N", default_value_t = 1, help_heading = OUTPUT, value_parser = clap::value_parser!(u64).range(1..=16))]
     pub hands: u64,
@@ -258,7 +255,7 @@ pub struct PlayArgs {
     /// Rendering quality; high adds shadows, reflections and smooth edges [default: fast for a film, else high]
     #[arg(long, value_parser = quality(), hide_possible_values = true, value_name = "fast|high", help_heading = PICTURE)]
     pub quality: Option<Quality>,
-    /// Camera and meshes.
+    /// Page, camera and meshes.
     #[command(flatten)]
     pub shot: ShotArgs,
     /// The options that were given, for [`expect_together`].
@@ -296,12 +293,11 @@ pub struct ViewArgs {
     #[arg(long, default_value_t = 0, value_parser = seed(), help_heading = SETTINGS)]
     pub seed: u64,
     /// Write one picture (.png) and exit, without opening a window; needs no display
-    #[arg(long, value_name = "FILE", value_parser = destination(&["png"]))]
+    #[arg(long, value_name = "FILE", value_parser = destination(&["png"]), help_heading = OUTPUT)]
     pub out: Option<Destination>,
-    /// Show the hand in a browser, with a slider for each actuator, at this port of 127.0.0.1 (0: any free port) [default port:
-    /// 7070]
-    #[arg(long, value_name = "PORT", num_args = 0..=1, default_missing_value = "7070")]
-    pub web: Option<u16>,
+    /// Fetch the meshes of the hand and exit, to show them later without a network
+    #[arg(long, exclusive = true)]
+    pub fetch: bool,
     /// Time of the picture in the episode, in seconds
     #[arg(long, value_name = "SECONDS", default_value = "0.5", value_parser = seconds)]
     pub at: f64,
@@ -311,7 +307,7 @@ pub struct ViewArgs {
     /// Rendering quality; high adds shadows, reflections and smooth edges
     #[arg(long, default_value = "high", value_parser = quality(), hide_possible_values = true, value_name = "fast|high")]
     pub quality: Quality,
-    /// Camera and meshes.
+    /// Page, camera and meshes.
     #[command(flatten)]
     pub shot: ShotArgs,
     /// The options that were given, for [`expect_together`].
@@ -319,9 +315,16 @@ pub struct ViewArgs {
     pub given: Vec<String>,
 }
 
-/// The options for what is seen.
+/// The options for what is seen, and where.
 #[derive(Args)]
 pub struct ShotArgs {
+    /// Show the hand in a browser, at this port of 127.0.0.1 (0: any free port) [default port: 7070]
+    #[arg(long, value_name = "PORT", num_args = 0..=1, default_missing_value = "7070", help_heading = OUTPUT)]
+    pub web: Option<u16>,
+    /// Host name by which a proxy asks for the page of --web, such as jupyter-server-proxy or Open OnDemand. The page is then served on
+    /// all addresses of this machine, and each request needs the token in the address that is printed
+    #[arg(long, value_name = "NAME", help_heading = OUTPUT)]
+    pub web_host: Option<String>,
     /// Viewing direction in degrees and distance in m, e.g. 150,-27,0.66
     #[arg(long, value_name = "AZIMUTH,ELEVATION,DISTANCE", value_parser = camera, allow_hyphen_values = true, help_heading = PICTURE)]
     pub camera: Option<Camera>,

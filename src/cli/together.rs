@@ -42,6 +42,7 @@ const GO_WITH: [Row; 6] = [
         "a page in a browser (--web)",
         &[
             "--web",
+            "--web-host",
             "--hands",
             "--follow",
             "--ckpt",

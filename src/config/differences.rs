@@ -41,22 +41,17 @@ impl Config {
         both.filter(|(_, [own, other])| own != other).collect()
     }
 
-    /// All settings by dotted key, except settings that only divide the work.
+    /// All settings by dotted key, except settings that only divide the work, each of one type in every run: what may be a ramp or a
+    /// table is a text.
     pub fn dotted(&self) -> Table {
         let mut own = self.flat();
         own.retain(|key, _| !["run.threads", "run.shards"].contains(&key));
-        own
-    }
-
-    /// The settings of [`dotted`](Self::dotted), each of one type in every run: what may be a ramp or a table is a text.
-    pub fn comparable(&self) -> Table {
-        let mut all = self.dotted();
-        for (key, value) in &mut all {
+        for (key, value) in &mut own {
             if lookup(&DEFAULTS, key).is_some_and(Value::is_table) {
                 *value = value.to_string().into();
             }
         }
-        all
+        own
     }
 
     /// The settings that change in the course of a run, by dotted key.
@@ -68,7 +63,7 @@ impl Config {
     }
 
     /// All settings by dotted key.
-    fn flat(&self) -> Table {
+    pub fn flat(&self) -> Table {
         let own = Table::try_from(self).expect("a configuration is a tree of tables");
         settings(&own)
             .map(|(key, value)| (key, value.clone()))
@@ -133,7 +128,7 @@ mod tests {
         let of = |sets: &[&str]| {
             let sets: Vec<_> = sets.iter().map(|set| set.parse().unwrap()).collect();
             let config = Settings::new().sets(&sets).resolve().unwrap();
-            config.comparable()
+            config.dotted()
         };
         let all = |to: &str| {
             let ramps = DEFAULTS.iter().flat_map(|(section, keys)| {

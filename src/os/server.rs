@@ -5,7 +5,7 @@ use std::io::Write;
 use std::net::{Ipv4Addr, TcpListener, TcpStream};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, anyhow};
 
@@ -26,10 +26,17 @@ const CROWDED: &str = "503 Service Unavailable";
 /// What happens with the body of a POST to `controls`. An error is a sentence about it.
 pub type OnPost = Box<dyn Fn(&[u8]) -> Result<(), &'static str> + Send + Sync>;
 
+/// The port of a page (0: any free one), and the host name by which a proxy asks for it.
+pub type Place<'a> = (u16, Option<&'a str>);
+
 /// A page that is served as long as the program runs.
 pub struct Server {
     /// Its port.
     pub port: u16,
+    /// The host name by which a proxy asks.
+    host: String,
+    /// What each request must have in its address: a query with a secret, or nothing.
+    pub token: String,
     page: String,
     on_post: Option<OnPost>,
     news: Mutex<News>,
@@ -57,31 +64,35 @@ impl News {
 }
 
 impl Server {
-    /// Serves a page on this port of 127.0.0.1 (0: any free one), whose readers get the event `hello` first. Without `on_post`, no
-    /// request changes anything.
+    /// Serves a page on this port of 127.0.0.1, whose readers get the event `hello` first. A proxy may run on another machine: for it,
+    /// the page is served on all addresses, and each request must have a token. Without `on_post`, no request changes anything.
     ///
     /// # Errors
     /// Fails if the port cannot be opened, or if the system refuses a thread.
     pub fn open(
-        port: u16,
+        (port, host): Place,
         page: String,
         hello: &str,
         on_post: Option<OnPost>,
     ) -> Result<Arc<Self>> {
+        let address = host.map_or(Ipv4Addr::LOCALHOST, |_| Ipv4Addr::UNSPECIFIED);
         let cannot = |error| {
             anyhow!(
-                "cannot use port {port} of 127.0.0.1: {error}; choose another one, or 0 for any free port"
+                "cannot use port {port} of {address}: {error}; choose another one, or 0 for any free port"
             )
         };
-        let listener = TcpListener::bind((Ipv4Addr::LOCALHOST, port)).map_err(cannot)?;
+        let listener = TcpListener::bind((address, port)).map_err(cannot)?;
         let port = listener.local_addr().map_err(cannot)?.port();
         let news = Mutex::new(News {
             hello: hello.into(),
             ..News::default()
         });
         let [readers, connections] = Default::default();
+        let token = host.map(|_| format!("?access={:032x}", rand::random::<u128>()));
         let server = Arc::new(Self {
             port,
+            host: host.unwrap_or("localhost").into(),
+            token: token.unwrap_or_default(),
             page,
             on_post,
             news,
@@ -171,25 +182,26 @@ impl Server {
     }
 
     fn answer(&self, stream: &mut TcpStream, request: &Request) -> Result<(), Refusal> {
-        request.expect_local()?;
+        request.expect_known(&self.host, &self.token)?;
         let not_here = "This method is not allowed here.";
         // An error of a write is a reader that has gone, or has read nothing for too long.
-        let _ = match (&*request.method, &*request.path, &self.on_post) {
-            ("GET", "/", _) => answer(stream, "200 OK", "text/html", &self.page),
-            ("GET", "/events", _) => {
+        let _ = match (&*request.method, &*request.name, &self.on_post) {
+            ("GET", "", _) => answer(stream, "200 OK", "text/html", &self.page),
+            ("GET", "events", _) => {
+                request.expect_own()?;
                 let permit = self.take_permit(&self.readers, MOST_READERS);
                 let _permit = permit.ok_or((CROWDED, "There are too many viewers."))?;
                 self.send_events(stream)
             }
-            ("POST", "/controls", Some(on_post)) => {
+            ("POST", "controls", Some(on_post)) => {
                 request.expect_own()?;
                 on_post(&request.body).map_err(|sentence| ("400 Bad Request", sentence))?;
                 stream.write_all(head("204 No Content", &[]).as_bytes())
             }
-            (_, "/" | "/events", _) => {
+            (_, "" | "events", _) => {
                 return Err(("405 Method Not Allowed\r\nAllow: GET", not_here));
             }
-            (_, "/controls", Some(_)) => {
+            (_, "controls", Some(_)) => {
                 return Err(("405 Method Not Allowed\r\nAllow: POST", not_here));
             }
             _ => return Err(("404 Not Found", "There is no such page.")),
@@ -203,7 +215,9 @@ impl Server {
             let news = self.news();
             (head("200 OK", &more) + &news.hello, news.next())
         };
-        loop {
+        // A proxy must ask again: it may go on reading when its reader has gone.
+        let end = Instant::now() + Duration::from_secs(60);
+        while self.token.is_empty() || Instant::now() < end {
             stream.write_all(text.as_bytes())?;
             let waited = self
                 .changed
@@ -218,5 +232,6 @@ impl Server {
             };
             next = news.next();
         }
+        Ok(())
     }
 }

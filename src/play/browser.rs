@@ -11,7 +11,7 @@ use toml::Table;
 use super::stage::Stage;
 use crate::config::{MODEL, Override, Reader, Settings, Source, short};
 use crate::load::PolicySource;
-use crate::os::{self, Destination, Stamp, say};
+use crate::os::{self, Destination, Place, Stamp, say};
 use crate::repose::Task;
 use crate::run::{self, RunFolder};
 use crate::see::{self, About, Live, Replay};
@@ -86,7 +86,7 @@ impl Followed {
 /// # Errors
 /// Fails if the port cannot be opened.
 pub fn live(
-    (port, hands): (u16, u64),
+    (place, hands): (Place, u64),
     shot: &Look,
     stage: Stage,
     mut followed: Option<Followed>,
@@ -103,7 +103,7 @@ pub fn live(
         };
     }
     let mut acting = stage.clone().acting(task.clone());
-    let live = Live::open(port, (&about, shot.camera), hands as usize, &acting, None)?;
+    let live = Live::open(place, (&about, shot.camera), hands as usize, &acting, None)?;
     let load = |path: &Path| {
         let newer = Stage {
             choice: stage.choice,

@@ -48,7 +48,7 @@ pub fn play(args: &PlayArgs, requests: &Requests) -> Result<ExitCode> {
             let newest: Option<&Path> = followed.as_ref().map(|followed| &*followed.path);
             let stage = Stage::set(newest.or(place), args)?;
             browser::live(
-                (port, args.hands),
+                ((port, args.shot.web_host.as_deref()), args.hands),
                 &shot,
                 stage,
                 followed,

@@ -52,7 +52,7 @@ impl Plan {
     pub fn of(args: &PlayArgs, opens_windows: bool) -> Result<Self, Error> {
         let picture = only(&args.out, "pictures of a table", &["svg", "png"])?;
         let outputs = Outputs::of(args)?;
-        let (plan, made) = match (&args.from_trace, &outputs.page, args.web) {
+        let (plan, made) = match (&args.from_trace, &outputs.page, args.shot.web) {
             (Some(trace), Some(page), _) => (
                 Self::Replay(trace.clone(), page.clone(), outputs.shot),
                 vec![Made::Page],
@@ -219,6 +219,10 @@ mod tests {
             (
                 "--headless --size 64x64",
                 "it applies only to a film or a picture (--out)",
+            ),
+            (
+                "--web-host hub.example",
+                "it applies only to a page in a browser (--web)",
             ),
             (
                 "--hands 1",

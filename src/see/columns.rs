@@ -189,7 +189,7 @@ impl Columns {
             "title": about.title,
             "program": format!("shadow-repose {}", env!("CARGO_PKG_VERSION")),
             "policy": about.policy,
-            "seed": about.seed,
+            "seed": about.seed.map(|seed| seed.to_string()),
             "settings": config.unlike_default(),
             "dt": config.ctrl_dt,
             "every": 1,

@@ -15,14 +15,18 @@ use crate::sim::Look;
 /// # Errors
 /// Fails like [`Task::for_display`].
 pub fn task_for_display(task: &Task, look: &Look) -> Result<Arc<Task>> {
-    let note = |error: &Error| os::say!("note: {error:#}; primitives are shown instead");
+    let note = |error: &Error| {
+        os::say!(
+            "note: {error:#}; primitives are shown instead, as with --plain\n  `shadow-repose view --fetch` fetches the meshes, even beforehand"
+        )
+    };
     // Only the built-in hand has meshes.
     let prefix = task
         .hand
         .side()
         .filter(|_| !look.plain && task.config.model_file().is_none());
     let meshes = |prefix: &str| {
-        os::hand_meshes(&mesh_files())
+        os::hand_meshes(&mesh_files(), false)
             .inspect_err(note)
             .ok()
             .map(|meshes| dress(prefix, meshes))

@@ -14,7 +14,7 @@ use super::columns::{About, Columns};
 use super::sliders::Sliders;
 use crate::env::End;
 use crate::evaluate::{Episodes, Player};
-use crate::os::{self, Machine, Server};
+use crate::os::{self, Machine, Place, Server};
 use crate::repose::{Task, TaskReward, add};
 use crate::sim::Camera;
 
@@ -62,12 +62,12 @@ struct LiveHand {
 }
 
 impl Live {
-    /// Serves a page with `hands` hands on this port, and says where. The first episodes are `acting`'s.
+    /// Serves a page with `hands` hands at this place, and says where. The first episodes are `acting`'s.
     ///
     /// # Errors
     /// Fails if the port cannot be opened.
     pub fn open(
-        port: u16,
+        place: Place,
         (about, camera): (&About, Option<Camera>),
         hands: usize,
         acting: &LiveActor,
@@ -88,17 +88,20 @@ impl Live {
             .collect();
         let hello = hello(&key, &hands, sliders.as_ref());
         let server = Server::open(
-            port,
+            place,
             page.html(),
             &hello,
             sliders.as_ref().map(Sliders::on_post),
         )?;
-        let port = server.port;
+        let Server { port, token, .. } = &*server;
         let machine = Machine::this().name;
         os::say!(
-            "the hand is at http://127.0.0.1:{port}/ (Ctrl-C ends)\n\
+            "the hand is at http://127.0.0.1:{port}/{token} (Ctrl-C ends)\n\
              from another machine: ssh -L {port}:127.0.0.1:{port} {machine}, and the same address there"
         );
+        if let (_, Some(host)) = place {
+            os::say!("by a proxy: its address at {host} for port {port}, with {token} at the end");
+        }
         Ok(Self {
             columns,
             server,
@@ -241,7 +244,7 @@ mod tests {
             seed: None,
         };
         let [first, second] = [task(&[]), task(&["env.max_episode_seconds=3"])];
-        let mut live = Live::open(0, (&about, None), 1, &acting(&first), None).unwrap();
+        let mut live = Live::open((0, None), (&about, None), 1, &acting(&first), None).unwrap();
         let seconds = |live: &Live| {
             live.hands[0]
                 .player

@@ -76,7 +76,7 @@ impl Lead {
         let mut report = Report::new(saver.held.folder.path(), &tags, progress);
         report.descriptions = described(&tags);
         report.settings = config.to_text();
-        report.hparams = config.comparable();
+        report.hparams = config.dotted();
         report.best = session.best.map(|[goals, _]| goals);
         Self {
             report,

@@ -62,7 +62,7 @@ pub fn hints(config: &Config, args: &TrainArgs, default: &Config, scene: usize) 
 fn reached(config: &Config, key: &str) -> f64 {
     match config.ramps().into_iter().find(|(ramped, _)| ramped == key) {
         Some((_, ramp)) => ramp.at(0).max(ramp.at(config.run.total_steps)),
-        None => config.dotted()[key].as_float().expect("a number"),
+        None => config.flat()[key].as_float().expect("a number"),
     }
 }
 
@@ -80,7 +80,7 @@ fn without_effect(config: &Config, default: &Config) -> Vec<String> {
             is_about(keys) && *other != key && reached(config, other) <= *most
         });
         if let Some((_, other, _)) = cause {
-            let [value, cause] = [&value, &config.dotted()[*other]].map(short);
+            let [value, cause] = [&value, &config.flat()[*other]].map(short);
             notes.push(format!(
                 "{key} = {value} has little or no effect with {other} = {cause}"
             ));

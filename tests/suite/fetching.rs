@@ -182,7 +182,7 @@ fn damaged_meshes_are_fetched_again_and_where_that_fails_the_folder_to_delete_is
 
 #[test]
 fn what_python_says_is_cut_and_where_it_says_nothing_its_status_is_told() {
-    let (place, cache) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
+    let place = tempfile::tempdir().unwrap();
     let path = format!(
         "{}:{}",
         place.path().display(),
@@ -200,12 +200,89 @@ fn what_python_says_is_cut_and_where_it_says_nothing_its_status_is_told() {
         ("exit 3", "python3 failed: exit status: 3"),
     ] {
         write_script(&place.path().join("python3"), script);
+        let cache = tempfile::tempdir().unwrap();
         let said = draw(place.path(), cache.path(), &[("PATH", &path)]);
         assert!(
             said.len() < 1500 && said.contains(told),
             "{script}: {} bytes",
             said.len()
         );
+    }
+}
+
+#[test]
+fn a_fetch_that_hangs_is_given_up_after_ten_seconds_and_not_tried_again_for_a_day() {
+    let (place, cache) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
+    let (folder, python) = (place.path(), place.path().join("python3"));
+    write_script(&python, "echo x >> tried; exec sleep 100");
+    let path = format!("{}:{}", folder.display(), std::env::var("PATH").unwrap());
+    let timed = || {
+        let began = Instant::now();
+        let said = draw(folder, cache.path(), &[("PATH", &path)]);
+        (said, began.elapsed())
+    };
+    let (said, time) = timed();
+    assert!((9..30).contains(&time.as_secs()), "{time:?}");
+    for part in [
+        "cannot fetch the meshes",
+        "within 9s",
+        "--plain",
+        "view --fetch",
+    ] {
+        assert!(said.contains(part), "{said}");
+    }
+    assert!(folder.join("hand.png").exists(), "without them: {said}");
+    write_script(&python, "exit 1");
+    let (said, _) = timed();
+    assert!(
+        !said.contains("fetching") && said.contains("less than a day ago"),
+        "{said}"
+    );
+    assert!(said.contains("--plain") && said.contains("view --fetch"));
+    // Who asks for it tries again.
+    let fetch = |args: &[&str]| {
+        command(folder, args)
+            .env("XDG_CACHE_HOME", cache.path())
+            .env("PATH", &path)
+            .output()
+            .unwrap()
+    };
+    let failed = fetch(&["view", "--fetch"]);
+    assert_eq!(failed.status.code(), Some(1));
+    assert!(stderr(&failed).contains("exit status: 1"));
+    assert_eq!(
+        fetch(&["view", "--fetch", "--plain"]).status.code(),
+        Some(2)
+    );
+    // Also a day later.
+    let mark = cache.path().join("shadow-repose/shadow-hand-meshes.failed");
+    let before = std::time::SystemTime::now() - Duration::from_secs(25 * 3600);
+    fs::File::options()
+        .append(true)
+        .open(mark)
+        .unwrap()
+        .set_modified(before)
+        .unwrap();
+    assert!(timed().0.contains("fetching"));
+}
+
+#[test]
+fn meshes_are_fetched_beforehand_by_a_command_that_says_where_they_are() {
+    let place = tempfile::tempdir().unwrap();
+    let output = command(place.path(), &["view", "--fetch"])
+        .output()
+        .unwrap();
+    let said = stderr(&output);
+    if !output.status.success() {
+        eprintln!("not tested: the meshes cannot be fetched here: {said}");
+        return;
+    }
+    let folder = said
+        .lines()
+        .find_map(|line| line.strip_prefix("the place of the hand's meshes is "))
+        .unwrap();
+    for name in mesh_files() {
+        assert!(Path::new(folder).join(name).exists(), "{name}");
     }
 }
 

@@ -243,7 +243,7 @@ fn a_file_holds_what_the_trace_holds_and_the_page_makes_the_poses_of_mujoco_of_i
         assert_eq!(file.meta["settings"]["env.max_episode_seconds"], 0.4);
         assert_eq!(
             (&file.meta["seed"], &file.meta["dt"], &file.meta["live"]),
-            (&json!(0), &json!(0.01), &json!(false))
+            (&json!("0"), &json!(0.01), &json!(false))
         );
         // The same from the trace alone, which knows all settings but the place of the scene.
         let again = [
@@ -311,6 +311,20 @@ fn a_file_holds_what_the_trace_holds_and_the_page_makes_the_poses_of_mujoco_of_i
         );
         assert_eq!(found["episodes"], 2);
     }
+}
+
+#[test]
+fn the_page_shows_every_digit_of_a_large_seed() {
+    let folder = tempfile::tempdir().unwrap();
+    let play = ["play", "--ckpt", "zero", "--plain", "--out", "x.html"];
+    // JavaScript has no such number.
+    let seed = "9007199254740993";
+    succeeded(program(
+        folder.path(),
+        &[&play[..], &["--seed", seed], &SHORT].concat(),
+    ));
+    let file = File::read(&folder.path().join("x.html"));
+    assert_eq!(file.meta["seed"], seed);
 }
 
 #[test]
@@ -516,6 +530,8 @@ fn a_browser_draws_the_file_with_and_without_webgl_and_has_nothing_to_complain_o
 struct Live {
     program: Child,
     port: u16,
+    /// The end of the address, from a question mark on.
+    query: String,
 }
 
 impl Live {
@@ -525,15 +541,24 @@ impl Live {
             .stderr(Stdio::piped())
             .spawn()
             .unwrap();
-        let mut live = Self { program, port: 0 };
+        let mut live = Self {
+            program,
+            port: 0,
+            query: String::new(),
+        };
         let mut said = BufReader::new(live.program.stderr.take().unwrap());
         let mut all = String::new();
         while live.port == 0 {
             assert!(said.read_line(&mut all).unwrap() > 0, "{all}");
             let address = all
                 .split_once("http://127.0.0.1:")
-                .and_then(|(_, rest)| rest.split('/').next());
-            live.port = address.map_or(0, |port| port.parse().unwrap());
+                .and_then(|(_, rest)| rest.split(' ').next())
+                .and_then(|address| address.split_once('/'));
+            let Some((port, query)) = address else {
+                continue;
+            };
+            live.port = port.parse().unwrap();
+            live.query = query.to_owned();
         }
         // What it says later is read, so that it does not wait.
         std::thread::spawn(move || std::io::copy(&mut said, &mut std::io::sink()));
@@ -657,7 +682,7 @@ fn a_live_page_is_fed_by_the_hands_that_play_and_says_what_a_file_says() {
     let meta: Value = serde_json::from_str(block(&page, "meta")).unwrap();
     assert_eq!(
         (&meta["live"], &meta["hands"], &meta["every"], &meta["seed"]),
-        (&json!(true), &json!(2), &json!(2), &json!(5))
+        (&json!(true), &json!(2), &json!(2), &json!("5"))
     );
     assert!(block(&page, "rows").is_empty());
     let mut events = live.events();
@@ -773,6 +798,109 @@ fn a_slider_moves_an_actuator_and_only_the_page_can_move_it() {
         "POST /controls HTTP/1.1\r\nHost: localhost\r\n{own}Content-Length: 7\r\n\r\n[[3,9]]"
     );
     assert_eq!(status(&play.ask(request.as_bytes())), "404");
+}
+
+#[test]
+fn behind_a_proxy_each_request_needs_the_token_of_the_printed_address_and_a_stream_ends() {
+    let folder = tempfile::tempdir().unwrap();
+    let view = ["view", "--web", "0", "--plain", "--web-host", "hub.example"];
+    let live = Live::start(folder.path(), &view);
+    let Live { port, query, .. } = &live;
+    let token = query.strip_prefix("?access=").unwrap();
+    assert!(token.len() == 32 && token.bytes().all(|c| c.is_ascii_hexdigit()));
+    let other = Live::start(folder.path(), &view);
+    assert_ne!(*query, other.query, "it is drawn anew");
+    drop(other);
+
+    let asked = |path: &str, host: &str, more: &str| {
+        let mut stream = live.connect();
+        write!(
+            stream,
+            "{path} HTTP/1.1\r\nHost: {host}\r\n{more}\r\n[[3,0.1]]"
+        )
+        .unwrap();
+        let mut answer = [0; 12];
+        stream.read_exact(&mut answer).unwrap();
+        String::from_utf8_lossy(&answer[9..]).into_owned()
+    };
+    let sent =
+        "Origin: https://hub.example\r\nContent-Type: application/json\r\nContent-Length: 9\r\n";
+    for (path, host, more, expected) in [
+        ("GET /", "hub.example", "", "403"),
+        ("GET /", "localhost", "", "403"),
+        ("GET /?access=", "hub.example", "", "403"),
+        ("GET /events", "hub.example", "", "403"),
+        ("POST /controls", "hub.example", sent, "403"),
+        ("GET /TOKEN", "evil.example", "", "403"),
+        ("GET /TOKEN", "hub.example", "", "200"),
+        ("GET /TOKEN", "Hub.Example:8000", "", "200"),
+        ("GET /TOKEN", "localhost", "", "200"),
+        ("GET /node/n1/7070/TOKEN", "hub.example", "", "200"),
+        (
+            "GET /user/me/proxy/7070/eventsTOKEN",
+            "hub.example",
+            "",
+            "200",
+        ),
+        (
+            "GET /eventsTOKEN",
+            "hub.example",
+            "Sec-Fetch-Site: cross-site\r\n",
+            "403",
+        ),
+        (
+            "POST /node/n1/7070/controlsTOKEN",
+            "hub.example",
+            sent,
+            "204",
+        ),
+        ("GET /otherTOKEN", "hub.example", "", "404"),
+    ] {
+        let path = path.replace("TOKEN", query);
+        assert_eq!(asked(&path, host, more), expected, "{path} {host} {more}");
+    }
+    // A proxy may be on another machine.
+    assert!(TcpStream::connect(("127.0.0.2", *port)).is_ok());
+    let alone = Live::start(folder.path(), &view[..4]);
+    assert!(alone.query.is_empty() && TcpStream::connect(("127.0.0.2", alone.port)).is_err());
+
+    // A proxy may go on reading for somebody who has gone.
+    let mut stream = live.connect();
+    write!(
+        stream,
+        "GET /events{query} HTTP/1.1\r\nHost: hub.example\r\n\r\n"
+    )
+    .unwrap();
+    let began = Instant::now();
+    stream.read_to_end(&mut Vec::new()).unwrap();
+    assert!((50..80).contains(&began.elapsed().as_secs()));
+}
+
+#[test]
+fn a_page_of_another_site_takes_no_place_of_a_viewer() {
+    let folder = tempfile::tempdir().unwrap();
+    let live = Live::start(
+        folder.path(),
+        &["play", "--ckpt", "zero", "--web", "0", "--plain"],
+    );
+    for from in [
+        "Origin: http://evil.example",
+        "Origin: null",
+        "Sec-Fetch-Site: cross-site\r\nOrigin: http://evil.example",
+        "Sec-Fetch-Site: same-site",
+    ] {
+        let request = format!("GET /events HTTP/1.1\r\nHost: localhost\r\n{from}\r\n\r\n");
+        assert_eq!(status(&live.ask(request.as_bytes())), "403", "{from}");
+    }
+    let mut own = live.connect();
+    write!(
+        own,
+        "GET /events HTTP/1.1\r\nHost: localhost\r\nSec-Fetch-Site: same-origin\r\n\r\n"
+    )
+    .unwrap();
+    let mut answer = [0; 12];
+    own.read_exact(&mut answer).unwrap();
+    assert!(answer.ends_with(b"200"));
 }
 
 #[test]
@@ -991,6 +1119,10 @@ fn options_of_a_page_that_do_not_go_together_are_refused() {
             "--at cannot be used with a page in a browser",
         ),
         (&["view", "--web", "--out", "x.png"], "cannot be used with"),
+        (
+            &["view", "--web-host", "h", "--out", "x.png"],
+            "it applies only to a page in a browser (--web)",
+        ),
     ] {
         let output = program(folder.path(), args);
         let said = stderr(&output);
