@@ -16,14 +16,24 @@ METRICS = {"turned": 3, "eval/goals": 2, "eval/drop_rate": 3}
 TIMED = 50
 
 
-class Log:
-    """The metrics of a run that has made an iteration."""
+class Damaged(Exception):
+    """A file of a run is not what a training run writes."""
 
-    def __init__(self, path):
-        with (path / "metrics.csv").open(newline="") as file:
-            self.rows = list(csv.DictReader(file))
-        self.steps = [int(row["env_steps"]) for row in self.rows]
-        seconds = [float(row["time/collect_s"]) + float(row["time/update_s"]) for row in self.rows]
+
+class Log:
+    """The metrics of a run that has made an iteration. Cells that are empty are NaN."""
+
+    def __init__(self, table):
+        try:
+            # The last line may be half written.
+            lines = table.read_text().rpartition("\n")[0].splitlines()
+            self.rows = [{name: float(cell or math.nan) for name, cell in row.items()} for row in csv.DictReader(lines)]
+            self.steps = [int(row["env_steps"]) for row in self.rows]
+            seconds = [row["time/collect_s"] + row["time/update_s"] for row in self.rows]
+        except (OSError, ValueError, KeyError, TypeError, OverflowError, csv.Error) as error:
+            raise Damaged(f"{table}: this is no table of a training run: {error!r}")
+        if not self.rows:
+            raise Damaged(f"{table}: it has no rows")
         self.seconds, spent = [], 0.0
         for first in range(0, len(seconds), TIMED):
             part = seconds[first:first + TIMED]
@@ -37,8 +47,8 @@ class Log:
             return math.nan
         end = next(i for i, steps in enumerate(self.steps) if steps >= at) + 1
         rows = zip(self.steps[:end], self.rows)
-        cells = [(steps, row.get(column(metric))) for steps, row in rows]
-        known = [(steps, float(cell)) for steps, cell in cells if cell not in ("", "NaN", None)]
+        cells = [(steps, row.get(column(metric), math.nan)) for steps, row in rows]
+        known = [(steps, value) for steps, value in cells if not math.isnan(value)]
         if metric.startswith("eval/"):
             return known[-1][1] if known else math.nan
         found = [value for steps, value in known if steps > self.steps[end - 1] - window]
@@ -143,14 +153,14 @@ def publish(sweep, folder):
     folder.mkdir(parents=True, exist_ok=True)
     found = []
     for run in sweep.all_runs():
-        if run.has_metrics():
+        if run.log():
             found.append(folder / f"{run.variant}-{run.seed}")
             subprocess.run([sys.executable, THIN, run.path, found[-1] / "metrics.csv"], check=True)
     shutil.copyfile(sweep.file, folder / "sweep.toml")
     if sweep.config:
         shutil.copyfile(sweep.config, folder / pathlib.Path(sweep.config).name)
     draw(sweep.program, found, folder / "picture.svg", ["--smooth", "1"])
-    version = (sweep.runs_of["base"][0].path / "version.txt").read_text().replace("\n", ", ").strip(", ")
+    version = (sweep.runs_of["base"][0].path / "version.txt").read_text(errors="replace").replace("\n", ", ").strip(", ")
     machine = f"{datetime.date.today()}, {(sweep.folder / 'machine.txt').read_text().strip()}"
     facts = f"{machine}.\nProgram: {version}."
     (folder / "README.md").write_text(f"# {folder.name}\n\n{facts}\n\n{tables(sweep)}\n![curves](picture.svg)\n")

@@ -19,7 +19,7 @@ def find(given):
         sys.exit(f"{path}: there is no such file")
     with path.open("rb") as file:
         first = file.readline()
-    return inside_wheel(path, first[2:].decode().split()) if first.startswith(b"#!") else path
+    return inside_wheel(path, first[2:].decode(errors="replace").split()) if first.startswith(b"#!") else path
 
 
 def inside_wheel(command, python):

@@ -11,8 +11,6 @@ import fcntl
 import json
 import os
 import pathlib
-import re
-import shutil
 import signal
 import subprocess
 import sys
@@ -24,11 +22,17 @@ import tomllib
 
 sys.dont_write_bytecode = True
 import compare
+import given
 import program
 
-# The keys of the file with their defaults, and the keys without a default with their types.
+# The keys of the file that have defaults. The others are then None.
 DEFAULTS = {"seeds": [0, 1], "set": [], "variants": {}, "stop": [], "keep": [], "table": [], "window": 1_000_000}
-OTHERS = {"steps": int, "config": str, "fork": str, "runs": int, "threads": int}
+
+
+# The most bytes of the header of a checkpoint that are read.
+MOST_HEADER = 1 << 24
+# What goes wrong in reading a file that something else has written or damaged.
+NOT_OURS = OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError
 
 
 class Sweep:
@@ -36,12 +40,11 @@ class Sweep:
 
     def __init__(self, file, folder, binary, runs, threads):
         self.file, self.folder, self.program = file, folder, binary
-        self.__dict__.update(dict.fromkeys(OTHERS) | DEFAULTS | read(file))
+        self.__dict__.update(dict.fromkeys(given.FILE) | DEFAULTS | given.read(file))
         # `fork` is relative to the folder of the runs, `config` to the file.
         self.fork = self.fork and os.path.normpath(folder / self.fork)
         self.config = self.config and str(file.resolve().parent / self.config)
-        if self.config and not pathlib.Path(self.config).is_file():
-            sys.exit(f"{self.config}: there is no such file")
+        self.settings = self.config and text_of(self.config)
         self.expect_rules()
         self.runs, self.threads = share(len(self.seeds) * (1 + len(self.variants)), runs or self.runs, threads or self.threads)
         # The steps at which trainings pause, to apply stop rules or to copy their checkpoint.
@@ -51,11 +54,13 @@ class Sweep:
         self.verdicts = {}
 
     def expect_rules(self):
-        """Exits unless the checkpoints to fork exist, and each stop rule is for steps that the base makes."""
-        forks = [pathlib.Path(self.fork.format(seed=seed)) for seed in self.seeds] if self.fork else []
-        if missing := [fork for fork in forks if not fork.is_file()]:
-            sys.exit(f"{missing[0]}: there is no such checkpoint")
-        begun = max(map(steps_of, forks), default=0)
+        """Exits unless the checkpoints to fork can be read, each training has steps to make, and each stop rule is for steps of the base."""
+        try:
+            begun = max(steps_of(fork_of(self.fork, seed)) for seed in self.seeds)
+        except compare.Damaged as error:
+            sys.exit(str(error))
+        if min([self.steps, *(of.get("steps", self.steps) for of in self.variants.values())]) <= begun:
+            sys.exit(f"{self.file}: `steps` must be above {begun:,}, the steps of the checkpoint that is forked")
         for rule in self.stop:
             if not begun < rule["at"] <= self.steps:
                 sys.exit(f"{self.file}: the base makes the steps from {begun:,} to {self.steps:,}, and this rule is for others: {rule}")
@@ -73,21 +78,21 @@ class Sweep:
                 pairs = [pair for pair in zip(self.runs_of["base"], self.runs_of[name]) if not any(run.failed for run in pair)]
                 if any(run.position() < rule["at"] for pair in pairs for run in pair):
                     return "waits"
-                logs = [[compare.Log(run.path) for run in pair] for pair in pairs]
-                self.verdicts[key] = compare.fails(rule, logs, self.window)
+                logs = [[run.log() for run in pair] for pair in pairs]
+                self.verdicts[key] = compare.fails(rule, [pair for pair in logs if None not in pair], self.window)
             if self.verdicts[key]:
                 return self.verdicts[key]
         return None
 
     def logs(self, name):
-        return {run.seed: compare.Log(run.path) for run in self.runs_of[name] if run.has_metrics()}
+        logs = {run.seed: run.log() for run in self.runs_of[name]}
+        return {seed: log for seed, log in logs.items() if log}
 
-    def expect_columns(self, run):
+    def expect_columns(self, log):
         """Exits unless a run that has begun logs the metrics of all stop rules."""
-        header = (run.path / "metrics.csv").read_text().partition("\n")[0].split(",")
         for rule in self.stop:
-            if compare.column(rule["metric"]) not in header:
-                sys.exit(f"{self.file}: metrics.csv has no column {rule['metric']}; it has {', '.join(header)}")
+            if compare.column(rule["metric"]) not in log.rows[0]:
+                sys.exit(f"{self.file}: metrics.csv has no column {rule['metric']}; it has {', '.join(log.rows[0])}")
 
     def begin(self):
         """Prepares the folder, and exits if it is in use. Returns the lock that keeps others from using it."""
@@ -122,10 +127,11 @@ class Run:
         self.path = sweep.folder / f"{variant}-{seed}"
         own = sweep.variants.get(variant, {})
         self.set = sweep.set + own.get("set", [])
-        self.fork = sweep.fork and sweep.fork.format(seed=seed)
+        self.fork = fork_of(sweep.fork, seed)
         self.end = own.get("steps", sweep.steps)
         self.pauses = sorted({at for at in sweep.pauses if at < self.end} | {self.end})
-        self.failed = None
+        # Why it failed, and the steps of the checkpoint from which it was last resumed.
+        self.failed, self.resumed = None, None
 
     def name(self):
         return f"{self.variant}, seed {self.seed}"
@@ -136,20 +142,33 @@ class Run:
     def checkpoints(self):
         return sorted((self.path / "checkpoints").glob("iteration-*.safetensors"))
 
-    def has_metrics(self):
-        """Returns whether it has made an iteration."""
+    def fail(self, reason):
+        self.failed = reason
+        say(f"{self.name()} failed, {reason}")
+
+    def log(self):
+        """Returns its metrics, or None if it has made no iteration. If they are damaged, the run has failed."""
         table = self.path / "metrics.csv"
-        return table.exists() and table.read_bytes().count(b"\n") > 1
+        try:
+            has_rows = table.exists() and table.read_bytes().count(b"\n") > 1
+            return compare.Log(table) if has_rows else None
+        except (compare.Damaged, OSError) as error:
+            return None if self.failed else self.fail(error)
+
+    def newest(self):
+        """Returns its newest undamaged checkpoint, from which the training resumes, or None."""
+        for checkpoint in reversed(self.checkpoints()):
+            with contextlib.suppress(compare.Damaged):
+                progress_of(checkpoint)
+                return checkpoint
+        return None
 
     def position(self):
-        """Returns the control steps of the newest checkpoint, from which the training resumes."""
-        found = self.checkpoints()
-        if found:
-            return steps_of(found[-1])
-        return steps_of(pathlib.Path(self.fork)) if self.fork else 0
+        """Returns the control steps that it has made."""
+        return steps_of(self.newest() or self.fork)
 
     def steps_per_iteration(self):
-        progress = progress_of(self.checkpoints()[-1])
+        progress = progress_of(self.newest())
         begun = progress.get("fork", {"iteration": 0, "env_steps": 0})
         return (progress["env_steps"] - begun["env_steps"]) // max(progress["iteration"] - begun["iteration"], 1)
 
@@ -162,7 +181,7 @@ class Run:
         end = ["--threads", self.sweep.threads, "--total-steps", self.pause()]
         if self.checkpoints():
             # A run does not find the user's own scene by itself.
-            scene = tomllib.loads((self.path / "config.toml").read_text())["env"].get("model", "builtin")
+            scene = scene_of(self.path / "config.toml")
             again = ["--set", f"env.model={scene}"] if scene != "builtin" else []
             return [self.sweep.program, "train", "--resume", self.path, *again, *end]
         begin = ["--fork", self.fork] if self.fork else ["--seed", self.seed]
@@ -173,7 +192,7 @@ class Run:
 
     def keep_copy(self):
         """At a pause, copies the checkpoint if the copy is wanted and does not exist yet."""
-        if not self.checkpoints():
+        if not self.newest():
             return
         position = self.position()
         passed = [at for at in self.pauses if at <= position < at + self.steps_per_iteration()]
@@ -182,7 +201,7 @@ class Run:
         copy = self.sweep.folder / "kept" / f"{self.variant}-{self.seed}-{passed[-1]}.safetensors"
         if not copy.exists():
             copy.parent.mkdir(exist_ok=True)
-            program.copy_whole(self.checkpoints()[-1], copy)
+            program.copy_whole(self.newest(), copy)
 
     def wait_until_free(self):
         """Waits until a training in this folder ends. Trainings of a killed sweep end by themselves, but not at once."""
@@ -195,12 +214,11 @@ class Run:
     def expect_settings(self):
         """Exits unless the folder was begun with the same settings. Returns the path of their record, and the settings."""
         of = self.sweep
-        config = pathlib.Path(of.config).read_text() if of.config else None
-        settings = {"fork": self.fork, "config": config, "set": self.set}
+        settings = {"fork": self.fork and str(self.fork), "config": of.settings, "set": self.set}
         record = self.beside("json")
         if self.path.exists() and not record.exists():
             sys.exit(f"{self.path}: there is a run, but no record of its settings; choose another folder")
-        if self.path.exists() and json.loads(record.read_text()) != settings:
+        if self.path.exists() and read_json(record) != settings:
             sys.exit(f"{record}: {self.name()} was begun with these settings, not with those of {of.file}; choose another folder")
         return record, settings
 
@@ -208,41 +226,13 @@ class Run:
         record, settings = self.expect_settings()
         record.write_text(json.dumps(settings, indent=1))
         self.wait_until_free()
+        self.resumed = self.position() if self.checkpoints() else None
         with self.beside("log").open("ab") as log:
             return subprocess.Popen([str(word) for word in self.command()], stdout=log, stderr=log, start_new_session=True,
                                     preexec_fn=at_low_priority)
 
     def last_words(self):
         return "\n".join(self.beside("log").read_text(errors="replace").splitlines()[-5:])
-
-
-def read(file):
-    """Returns what a file says, or exits with what is wrong with it."""
-    try:
-        given = tomllib.loads(file.read_text())
-    except (OSError, ValueError) as error:
-        sys.exit(f"{file}: {error}")
-    types = OTHERS | {key: type(value) for key, value in DEFAULTS.items()}
-    if unknown := set(given) - set(types):
-        sys.exit(f"{file}: unknown: {', '.join(sorted(unknown))}")
-    if wrong := [key for key, value in given.items() if not isinstance(value, types[key])]:
-        sys.exit(f"{file}: {wrong[0]} = {given[wrong[0]]!r} must be of type {types[wrong[0]].__name__}")
-    if "steps" not in given:
-        sys.exit(f"{file}: `steps` is missing")
-    seeds = given.get("seeds", DEFAULTS["seeds"])
-    if not seeds or len(set(seeds)) < len(seeds):
-        sys.exit(f"{file}: seeds = {seeds}: name at least one, and each once")
-    for name, of in given.get("variants", {}).items():
-        if name == "base" or not re.fullmatch(r"[\w.+-]+", name):
-            sys.exit(f"{file}: a variant cannot be called {name!r}: its name is one of a folder, and `base` is what it is compared with")
-        if not isinstance(of, dict) or set(of) - {"set", "steps"} or not isinstance(of.get("set", []), list):
-            sys.exit(f"{file}: a variant may only have `set`, a list, and `steps`: {name}")
-    for rule in given.get("stop", []):
-        if not {"at", "metric"} < set(rule) <= {"at", "metric", "below", "above"}:
-            sys.exit(f"{file}: a stop rule needs `at`, `metric`, and `below` or `above`: {rule}")
-    if "fork" in given and "{seed}" not in given["fork"] and len(seeds) > 1:
-        sys.exit(f"{file}: `fork` must contain {{seed}}, or all seeds would be the same training from one checkpoint")
-    return given
 
 
 def copy_in(folder):
@@ -258,15 +248,53 @@ def share(trainings, runs, threads):
     return runs, threads or max(1, cores // runs)
 
 
+def fork_of(pattern, seed):
+    """Returns the checkpoint that the training with this seed forks, or None."""
+    return pattern and pathlib.Path(pattern.replace("{seed}", str(seed)))
+
+
 def steps_of(checkpoint):
-    """Returns the control steps that a training had made when it wrote this checkpoint."""
-    return progress_of(checkpoint)["env_steps"]
+    """Returns the control steps that a training had made when it wrote this checkpoint. Without a checkpoint, these are none."""
+    return progress_of(checkpoint)["env_steps"] if checkpoint else 0
 
 
 def progress_of(checkpoint):
-    with checkpoint.open("rb") as file:
-        header = json.loads(file.read(int.from_bytes(file.read(8), "little")))
-    return json.loads(header["__metadata__"]["progress"])
+    """Returns the progress of the training that wrote a checkpoint: at least the counts `iteration` and `env_steps`."""
+    if not checkpoint.is_file():
+        raise compare.Damaged(f"{checkpoint}: there is no such checkpoint")
+    try:
+        with checkpoint.open("rb") as file:
+            header = file.read(min(int.from_bytes(file.read(8), "little"), MOST_HEADER))
+        progress = json.loads(json.loads(header)["__metadata__"]["progress"])
+        counts = [of[key] for of in (progress, progress.get("fork", progress)) for key in ("iteration", "env_steps")]
+    except NOT_OURS as error:
+        raise compare.Damaged(f"{checkpoint}: this is no checkpoint of a training run: {error!r}")
+    if not all(map(given.is_whole(0), counts)):
+        raise compare.Damaged(f"{checkpoint}: its progress is no progress of a training run")
+    return progress
+
+
+def scene_of(config):
+    """Returns the scene that the settings of a run name."""
+    try:
+        return tomllib.loads(config.read_text())["env"].get("model", "builtin")
+    except NOT_OURS as error:
+        raise compare.Damaged(f"{config}: these are no settings of a training run: {error!r}")
+
+
+def read_json(file):
+    """Returns what a file says, or None if it is damaged."""
+    with contextlib.suppress(ValueError, RecursionError):
+        return json.loads(file.read_text())
+
+
+def text_of(file):
+    if not pathlib.Path(file).is_file():
+        sys.exit(f"{file}: there is no such file")
+    try:
+        return pathlib.Path(file).read_text()
+    except (OSError, ValueError) as error:
+        sys.exit(f"{file}: {error}")
 
 
 def at_low_priority():
@@ -315,10 +343,11 @@ def work(sweep, at_work):
         for run in [run for run, child in at_work.items() if child.poll() is not None]:
             child = at_work.pop(run)
             if child.returncode != 0:
-                run.failed = f"exit code {child.returncode}, {run.beside('log')} ends with:\n{run.last_words()}"
-                say(f"{run.name()} failed, {run.failed}")
-            elif run.has_metrics():
-                sweep.expect_columns(run)
+                run.fail(f"exit code {child.returncode}, {run.beside('log')} ends with:\n{run.last_words()}")
+            elif run.position() == run.resumed:
+                run.fail(f"it made no step, {run.beside('log')} ends with:\n{run.last_words()}")
+            elif log := run.log():
+                sweep.expect_columns(log)
                 run.keep_copy()
                 say(f"{run.name()}: {run.position():,} of {run.end:,} steps")
         ready = []
@@ -334,9 +363,12 @@ def work(sweep, at_work):
         # First the runs that have not begun, then the least advanced, seed by seed. So all can be compared early.
         ready.sort(key=lambda run: (len(run.checkpoints()) > 0, run.pause(), sweep.seeds.index(run.seed)))
         for run in ready[:sweep.runs - len(at_work)]:
-            run.keep_copy()
-            at_work[run] = run.start()
-        if not at_work:
+            try:
+                run.keep_copy()
+                at_work[run] = run.start()
+            except (compare.Damaged, OSError) as error:
+                run.fail(error)
+        if not at_work and all(run.failed for run in ready):
             return
         time.sleep(0.5)
 
@@ -370,7 +402,7 @@ def main():
                 print(f"{run.name()}: {run.position():,} of {run.end:,} steps")
     whole = only_looks or train(sweep)
     print(compare.tables(sweep))
-    runs = [run.path for run in sweep.all_runs() if run.has_metrics()]
+    runs = [run.path for run in sweep.all_runs() if run.log()]
     if args.publish and not runs:
         sys.exit("there is nothing to publish yet")
     if args.publish:
@@ -381,4 +413,9 @@ def main():
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    # The name of a folder may be no text.
+    sys.stdout.reconfigure(errors="backslashreplace")
+    try:
+        sys.exit(main())
+    except OSError as error:
+        sys.exit(str(error))

@@ -27,8 +27,8 @@ pub use lock::{Hold, LOCK, Locked};
 pub use machine::{Machine, processor_seconds, program_checksum};
 pub use meshes::hand_meshes;
 pub use output::{
-    OutputFile, final_path, is_abandoned, make_own, name_also, nicety, put_aside, sync,
-    sync_folder, unused_name, write_whole,
+    OutputFile, final_path, is_abandoned, make_own, name_also, nicety, put_aside,
+    remove_unfinished, sync, sync_folder, unused_name, write_whole,
 };
 pub use progress::{Bar, Status, StatusLine, clock, progress_bar, steps_of_all};
 pub use screen::{Screen, aligned, text_of};

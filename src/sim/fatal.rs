@@ -59,4 +59,5 @@ fn report_fatal(message: &MjLogMessage) {
         None => crate::os::say!("error: {said}"),
     }));
     crate::os::drain();
+    crate::os::remove_unfinished();
 }

@@ -190,6 +190,30 @@ fn a_trace_that_is_interrupted_leaves_nothing_behind() {
 }
 
 #[test]
+fn a_fatal_error_of_mujoco_leaves_no_unfinished_file() {
+    let place = tempfile::tempdir().unwrap();
+    let folder = place.path();
+    let little = SCENE.replace("memory=\"2M\"", "memory=\"60K\"");
+    fs::write(folder.join("small.xml"), little).unwrap();
+    let play = [
+        "play",
+        "--ckpt",
+        "random",
+        "--headless",
+        "--episodes",
+        "64",
+        "--out",
+        "jsonl:trace",
+        "--set",
+        "env.model=small.xml",
+    ];
+    let output = program(folder, &play);
+    assert_eq!(output.status.code(), Some(1));
+    assert!(stderr(&output).contains("MuJoCo cannot continue"));
+    assert_eq!(names(folder), ["small.xml"]);
+}
+
+#[test]
 fn as_the_first_process_of_a_container_it_ends_with_128_and_the_number_of_the_signal() {
     let isolates = |flags: &str| {
         Command::new("unshare")

@@ -153,6 +153,145 @@ fn a_variant_that_fails_is_named_and_the_others_are_trained() {
 }
 
 #[test]
+fn whatever_is_wrong_in_the_file_of_a_sweep_is_told_in_a_line() {
+    if !has_python() {
+        return;
+    }
+    let place = tempfile::tempdir().unwrap();
+    let folder = place.path();
+    fs::write(folder.join("foreign"), [255; 100]).unwrap();
+    fs::write(folder.join("short"), b"\x02\0\0\0\0\0\0\0{}").unwrap();
+    let policy = concat!(
+        env!("CARGO_MANIFEST_DIR"),
+        "/assets/policies/repose.safetensors"
+    );
+    let forked = format!("steps = 9\nseeds = [0]\nfork = {policy:?}");
+    for (text, part) in [
+        ("", "`steps` is missing"),
+        ("steps = 0", "steps = 0 must be a whole number"),
+        ("steps = \"9\"", "steps = '9' must be"),
+        ("steps = 9.5", "steps = 9.5 must be"),
+        ("steps = true", "steps = True must be"),
+        ("steps = [[[", "what.toml: "),
+        ("steps = 9\nkeep = [\"x\"]", "keep = ['x'] must be a list"),
+        ("steps = 9\ntable = 3", "table = 3 must be a list"),
+        (
+            "steps = 9\nseeds = [[0], [1]]",
+            "seeds = [[0], [1]] must be",
+        ),
+        ("steps = 9\nseeds = [0, 0]", "seeds = [0, 0] must be"),
+        ("steps = 9\nseeds = [-1]", "seeds = [-1] must be"),
+        ("steps = 9\nseeds = []", "seeds = [] must be"),
+        ("steps = 9\nset = [1]", "set = [1] must be"),
+        (
+            "steps = 9\nset = [\"a\\u0000\"]",
+            "set = ['a\\x00'] must be",
+        ),
+        ("steps = 9\nruns = 0", "runs = 0 must be"),
+        ("steps = 9\nwindow = nan", "window = nan must be"),
+        ("steps = 9\nconfig = \"none.toml\"", "there is no such file"),
+        ("steps = 9\nconfig = \"foreign\"", "foreign: "),
+        ("steps = 9\nvariants = 3", "variants = 3 must be"),
+        (
+            "steps = 9\n[variants]\na = 3",
+            "the variant a must be a table",
+        ),
+        (
+            "steps = 9\n[variants.a]\nsteps = \"x\"",
+            "variant a: steps = 'x' must be",
+        ),
+        (
+            "steps = 9\n[variants.a]\nset = \"x\"",
+            "variant a: set = 'x'",
+        ),
+        ("steps = 9\nstop = [3]", "stop = [3] must be"),
+        (
+            "steps = 9\n[[stop]]\nat = \"x\"\nmetric = \"a\"",
+            "stop rule: at = 'x' must be",
+        ),
+        (
+            "steps = 9\n[[stop]]\nat = 9\nmetric = \"a\"\nbelow = \"x\"",
+            "stop rule: below = 'x' must be a number",
+        ),
+        (
+            "steps = 9\n[[stop]]\nat = 9\nmetric = [1]\nabove = 1",
+            "stop rule: metric = [1] must be",
+        ),
+        (
+            "steps = 9\n[[stop]]\nat = 9\nmetric = \"a\"",
+            "needs `at`, `metric`, and",
+        ),
+        (
+            "steps = 9\nseeds = [0]\nfork = \"../none\"",
+            "there is no such checkpoint",
+        ),
+        (
+            "steps = 9\nseeds = [0]\nfork = \"../foreign\"",
+            "no checkpoint of a training run",
+        ),
+        (
+            "steps = 9\nseeds = [0]\nfork = \"../short\"",
+            "no checkpoint of a training run",
+        ),
+        (&forked, "no checkpoint of a training run"),
+        (
+            "steps = 9\nfork = \"{seed}{other}{0}{\"",
+            "there is no such checkpoint",
+        ),
+    ] {
+        fs::write(folder.join("what.toml"), text).unwrap();
+        let output = sweep(folder).output().unwrap();
+        let said = String::from_utf8_lossy(&output.stderr);
+        assert_eq!(output.status.code(), Some(1), "{text}: {said}");
+        assert!(
+            said.contains(part) && said.lines().count() == 1,
+            "{text}: {part:?} is not alone in\n{said}"
+        );
+    }
+}
+
+#[test]
+fn a_garbled_file_of_a_run_ends_that_training_and_the_others_go_on() {
+    if !has_python() {
+        return;
+    }
+    let place = tempfile::tempdir().unwrap();
+    let folder = place.path();
+    let begin = |steps: u64| {
+        let what = format!(
+            "steps = {steps}\nseeds = [0, 1, 2, 3]\nset = {SMALL:?}\n[[stop]]\nat = 256\nmetric = \"policy/std\"\nabove = 9\n"
+        );
+        fs::write(folder.join("what.toml"), what).unwrap();
+        sweep(folder).output().unwrap()
+    };
+    succeeded(begin(256));
+    let run = |name: &str| folder.join("runs").join(name);
+    let checkpoints = |name: &str| {
+        let folder = run(name).join("checkpoints");
+        let found = names(&folder).into_iter();
+        let found = found.filter(|name| name.starts_with("iteration-"));
+        found.map(|name| folder.join(name)).collect::<Vec<_>>()
+    };
+    let garble = |path: &Path| fs::write(path, [255; 1000]).unwrap();
+    for path in checkpoints("base-0") {
+        garble(&path);
+    }
+    garble(&run("base-0").join("checkpoints/latest.safetensors"));
+    garble(checkpoints("base-1").last().unwrap());
+    garble(&run("base-2").join("metrics.csv"));
+    let output = begin(384);
+    let said = String::from_utf8_lossy(&output.stdout);
+    assert_eq!(output.status.code(), Some(1), "{said}");
+    assert!(output.stderr.is_empty(), "{output:?}");
+    assert!(said.contains("base, seed 0 failed"), "{said}");
+    assert!(!said.contains("base, seed 1 failed"), "{said}");
+    for name in ["base-1", "base-3"] {
+        assert_eq!(metrics(&run(name)).last().unwrap()[1], "384", "{name}");
+    }
+    succeeded(sweep(folder).arg("--table").output().unwrap());
+}
+
+#[test]
 fn a_sweep_keeps_the_program_that_it_began_with_and_its_folder_for_itself() {
     if !has_python() {
         return;
