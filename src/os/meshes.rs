@@ -50,8 +50,7 @@ pub fn hand_meshes(names: &[&str], asked: bool) -> Result<Vec<Vec<u8>>> {
             folder.display()
         )
     };
-    let patience = Duration::from_secs(if asked { 600 } else { 9 });
-    let fetched = fetch(&folder, names, patience);
+    let fetched = fetch(&folder, names, if asked { 600 } else { 9 });
     if fetched.is_err() {
         let _ = fs::write(failure, "");
     }
@@ -72,9 +71,9 @@ fn undamaged(folder: &Path, names: &[&str], checksum: u32) -> Option<Vec<Vec<u8>
     files.filter(|files| crc32fast::hash(&files.concat()) == checksum)
 }
 
-/// Unpacks the wheel beside `folder`, within this time, and moves the files one by one. Each appears completely or not at all, and
+/// Unpacks the wheel beside `folder`, within these seconds, and moves the files one by one. Each appears completely or not at all, and
 /// replaces an identical or damaged one.
-fn fetch(folder: &Path, names: &[&str], mut patience: Duration) -> Result<()> {
+fn fetch(folder: &Path, names: &[&str], seconds: u64) -> Result<()> {
     let work = Unfinished::beside(folder);
     // Held as long as the folder is open: others see that somebody fetches into it.
     let open = fs::create_dir_all(&work.path).and_then(|()| File::open(&work.path));
@@ -83,6 +82,7 @@ fn fetch(folder: &Path, names: &[&str], mut patience: Duration) -> Result<()> {
     let wheel = work.path.join("wheel");
     let inside = wheel.join(INSIDE);
     // Three programs run one after another, and each may wait for ever. One that begins after the end has no time.
+    let mut patience = Duration::from_secs(seconds);
     let _ = thread::Builder::new().spawn(move || {
         for _ in 0..3 {
             thread::sleep(patience);
@@ -106,7 +106,7 @@ fn fetch(folder: &Path, names: &[&str], mut patience: Duration) -> Result<()> {
     drop(lock);
     moved.with_context(|| {
         format!(
-            "cannot fetch the meshes of the Shadow Hand ({PACKAGE}) into {} within {patience:?}",
+            "cannot fetch the meshes of the Shadow Hand ({PACKAGE}) into {} within {seconds} s",
             folder.display()
         )
     })

@@ -88,11 +88,12 @@ impl Server {
             ..News::default()
         });
         let [readers, connections] = Default::default();
-        let token = host.map(|_| format!("?access={:032x}", rand::random::<u128>()));
         let server = Arc::new(Self {
             port,
             host: host.unwrap_or("localhost").into(),
-            token: token.unwrap_or_default(),
+            token: host.map_or_else(String::new, |_| {
+                format!("?access={:032x}", rand::random::<u128>())
+            }),
             page,
             on_post,
             news,

@@ -225,7 +225,7 @@ fn a_fetch_that_hangs_is_given_up_after_ten_seconds_and_not_tried_again_for_a_da
     assert!((9..30).contains(&time.as_secs()), "{time:?}");
     for part in [
         "cannot fetch the meshes",
-        "within 9s",
+        "within 9 s",
         "--plain",
         "view --fetch",
     ] {
