@@ -15,6 +15,7 @@ use crate::os::{self, say};
 use crate::ppo::{Checkpoint, Damaged, Policy, Progress};
 use crate::repose::{Record, Task, is_physical};
 use crate::run;
+use crate::sim::SceneFiles;
 
 /// A policy that is built into the program.
 pub struct BuiltIn {
@@ -105,17 +106,25 @@ impl PolicySource {
     /// # Errors
     /// Fails as [`read`] and [`settings`] do.
     pub fn load(&self, overrides: &[Override]) -> Result<(Checkpoint, Config)> {
-        let path = self.path();
         let checkpoint = match self {
             Self::BuiltIn(policy) => Checkpoint::parse(policy.bytes)?,
             Self::File(path) => read(path)?,
         };
-        let config = settings(&checkpoint, path, player(&checkpoint), overrides);
-        let config = match self {
-            Self::BuiltIn(_) => config?,
-            Self::File(_) => config.with_context(|| cannot_use(path))?,
-        };
+        let config = self.settings(&checkpoint, overrides)?;
         Ok((checkpoint, config))
+    }
+
+    /// The settings for playing a checkpoint from there, overlaid with `overrides`.
+    ///
+    /// # Errors
+    /// Fails as [`settings`] does.
+    fn settings(&self, checkpoint: &Checkpoint, overrides: &[Override]) -> Result<Config> {
+        let path = self.path();
+        let config = settings(checkpoint, path, player(checkpoint), overrides);
+        match self {
+            Self::BuiltIn(_) => config,
+            Self::File(_) => config.with_context(|| cannot_use(path)),
+        }
     }
 }
 
@@ -140,6 +149,8 @@ pub struct Loaded {
     pub policy: Policy,
     /// The checkpoint that holds it.
     pub checkpoint: Checkpoint,
+    /// A scene in memory, which need not be read if its task is in that scene.
+    pub files: Arc<SceneFiles>,
 }
 
 impl Loaded {
@@ -156,7 +167,20 @@ impl Loaded {
                 PolicySource::BuiltIn(&BUILTIN[0])
             }
         };
-        let (checkpoint, config) = origin.load(overrides)?;
+        let (checkpoint, _) = origin.load(overrides)?;
+        Self::new(origin, checkpoint, overrides)
+    }
+
+    /// Takes the policy from a checkpoint that was read from `origin`.
+    ///
+    /// # Errors
+    /// Fails as [`Loaded::find`] does.
+    pub fn new(
+        origin: PolicySource,
+        checkpoint: Checkpoint,
+        overrides: &[Override],
+    ) -> Result<Self> {
+        let config = origin.settings(&checkpoint, overrides)?;
         let record = Record::parse(&checkpoint.hand)?;
         let policy = Policy::load(&config.ppo, record.spaces(), &checkpoint)
             .with_context(|| format!("cannot use the policy {origin}"))?;
@@ -174,6 +198,7 @@ impl Loaded {
             record,
             policy,
             checkpoint,
+            files: Arc::default(),
         })
     }
 
@@ -182,12 +207,7 @@ impl Loaded {
     /// # Errors
     /// Fails as [`settings`] does.
     pub fn settings(&self, overrides: &[Override]) -> Result<Config> {
-        settings(
-            &self.checkpoint,
-            self.origin.path(),
-            player(&self.checkpoint),
-            overrides,
-        )
+        self.origin.settings(&self.checkpoint, overrides)
     }
 
     /// Loads its task, with settings overlaid with `overrides`.
@@ -196,14 +216,15 @@ impl Loaded {
     /// Fails as [`settings`] does, or if the scene cannot be used, or has another hand.
     pub fn task(&self, overrides: &[Override]) -> Result<Arc<Task>> {
         let config = self.settings(overrides)?;
-        let task = Task::new(&config)?.for_policy(&self.record)?;
+        let task = Task::with_files(&config, &self.files)?.for_policy(&self.record)?;
         if config.env.prediction == 0 {
             return Ok(task);
         }
         // Who predicts knows the physics that the policy was trained with, whatever the world is.
         let mut sets = overrides.to_vec();
         sets.retain(|set| !set.key.strip_prefix("env.").is_some_and(is_physical));
-        Ok(task.predicted_by(&*Task::new(&self.settings(&sets)?)?))
+        let model = Task::with_files(&self.settings(&sets)?, task.files())?;
+        Ok(task.predicted_by(&model))
     }
 }
 

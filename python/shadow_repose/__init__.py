@@ -42,10 +42,30 @@ def _expect_avx(facts: str = "/proc/cpuinfo") -> None:
         raise ImportError("this processor has no AVX, which MuJoCo needs (Intel and AMD have it since 2011)")
 
 
+def _binding() -> int:
+    """Returns the flags with which the extension module uses the symbols of its own MuJoCo, whatever libraries are loaded already.
+
+    All its symbols are bound at once, so a later library changes nothing. Only where another MuJoCo offers its symbols to all libraries,
+    ours come first. The module would then also take `free` from the C library, which must not free what another allocator has allocated.
+    """
+    import ctypes
+
+    everything = ctypes.CDLL(None)
+    if not hasattr(everything, "mj_step"):
+        return os.RTLD_NOW
+    [used, own] = (ctypes.cast(library.malloc, ctypes.c_void_p).value for library in (everything, ctypes.CDLL("libc.so.6")))
+    if used != own:
+        raise ImportError(
+            "the symbols of another MuJoCo are global and memory has another allocator than the C library's: "
+            "import shadow_repose first, or leave out one of the two"
+        )
+    return os.RTLD_NOW | os.RTLD_DEEPBIND
+
+
 def _load() -> Any:
-    """Loads the extension module. Its MuJoCo uses its own symbols, whatever libraries are loaded already."""
+    """Loads the extension module."""
     flags = sys.getdlopenflags()
-    sys.setdlopenflags(flags | getattr(os, "RTLD_DEEPBIND", 0))
+    sys.setdlopenflags(_binding())
     try:
         from . import _native
     finally:

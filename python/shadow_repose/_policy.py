@@ -3,18 +3,20 @@ from __future__ import annotations
 
 import json
 import os
-import zlib
+import warnings
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from . import _native
-from ._settings import absolute, flat, number, pairs
+from ._settings import flat, floats, number, pairs
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
+
+_native.prepare(np.zeros(1, np.float32))  # which Python could not do while it ends
 
 BUILT_IN = ("builtin", "robust")
 """The policies that come with the package."""
@@ -31,8 +33,7 @@ class Policy:
         if not isinstance(native, _native.Policy):
             raise TypeError("create a policy by Policy.load(place)")
         self._native = native
-        self._set: dict[str, Any] = {}
-        self._checksum = 0
+        self._set: list[tuple[str, str]] = []
 
     @classmethod
     def load(cls, place: str | os.PathLike[str] = "builtin", *, set: Mapping[str, Any] | None = None) -> Policy:
@@ -45,12 +46,29 @@ class Policy:
         Raises:
             FileNotFoundError, PermissionError: there is no such file, or it cannot be read.
             ValueError: the file is damaged or does not come from the program, or a setting is invalid.
+
+        A warning says where the policy does not fit its task well.
         """
-        place = os.fspath(place)
-        if place not in BUILT_IN and not os.path.exists(place):
-            raise FileNotFoundError(f"{place}: no such checkpoint or run folder; built in are {' and '.join(BUILT_IN)}")
-        policy = cls(_native.Policy(place, pairs(set)))
-        policy._set, policy._checksum = absolute(set), _checksum(policy._native.place)
+        policy = cls._loaded(place, set)
+        for warning in policy._native.warnings:
+            warnings.warn(warning, stacklevel=2)
+        return policy
+
+    @classmethod
+    def _loaded(cls, place: str | os.PathLike[str], set: Mapping[str, Any] | None) -> Policy:
+        """Loads a policy without a warning."""
+        place = os.fsdecode(os.fspath(place))
+        if place not in BUILT_IN:
+            if not os.path.exists(place):
+                raise FileNotFoundError(f"{place}: no such checkpoint or run folder; built in are {' and '.join(BUILT_IN)}")
+            place = os.path.abspath(place)
+        return cls._of(pairs(set), place)
+
+    @classmethod
+    def _of(cls, set: list[tuple[str, str]], *parts: Any) -> Policy:
+        """Loads a policy from a place, or from the parts of another."""
+        policy = cls(_native.Policy(parts[0], set, *parts[1:]))
+        policy._set = set
         return policy
 
     def __call__(
@@ -78,7 +96,7 @@ class Policy:
         return np.asarray(values[0] if is_one else values)
 
     def _rows(self, observations: ArrayLike) -> tuple[np.ndarray, bool]:
-        rows = np.asarray(observations, np.float32)
+        rows = floats("observations", observations)
         if rows.ndim not in (1, 2):
             raise ValueError(f"observations have the shape {rows.shape}, expected (B, O) or (O,)")
         return np.atleast_2d(rows), rows.ndim == 1
@@ -94,7 +112,7 @@ class Policy:
         return np.full(self._native.sizes()[1], self._native.std, np.float32)
 
     def __reduce__(self) -> Any:
-        return _reload, (os.fspath(self._native.place), self._set, self._checksum)
+        return self._of, (self._set, *self._native.parts())
 
     def __copy__(self) -> Policy:
         return self  # it never changes
@@ -104,21 +122,6 @@ class Policy:
 
     def __repr__(self) -> str:
         return f"<Policy: {self._native.name}>"
-
-
-def _checksum(place: str | os.PathLike[str]) -> int:
-    if os.fspath(place) in BUILT_IN:
-        return 0
-    with open(place, "rb") as file:
-        return zlib.crc32(file.read())
-
-
-def _reload(place: str, set: Mapping[str, Any], checksum: int) -> Policy:
-    """Loads a policy that was pickled."""
-    policy = Policy.load(place, set=set)
-    if policy._checksum != checksum:
-        raise ValueError(f"{place} holds another policy than the one that was pickled")
-    return policy
 
 
 def evaluate(
@@ -142,16 +145,19 @@ def evaluate(
         trace: a file for the steps of the first episodes. `shadow-repose play --from-trace TRACE --out FILE.html` shows them in a browser.
 
     Ctrl-C interrupts it, after the present call of a function. Raises ValueError as `Policy.load` does, and for actions of another shape
-    or that are not finite. Raises TypeError for actions that are not numbers, and whatever the function raises.
+    or that are NaN; others are clipped to [-1, 1], as in an environment. Raises TypeError for actions that are not numbers, and whatever
+    the function raises. Warns where a policy does not fit the task well, and of episodes whose physics has diverged.
     """
     counts = number("episodes", episodes, 1, 2**20), number("seed", seed), number("threads", threads, most=65536)
     if callable(policy) and not isinstance(policy, Policy):
         scored: Any = _acting(policy)
     else:
         if not isinstance(policy, Policy):
-            policy, set = Policy.load(policy, set=set), None
+            policy, set = Policy._loaded(policy, set), None
         scored = policy._native
-    text = _native.evaluate(scored, pairs(set), *counts, None if trace is None else os.fspath(trace))
+    text, said = _native.evaluate(scored, pairs(set), *counts, None if trace is None else os.path.abspath(trace))
+    for warning in said:
+        warnings.warn(warning, stacklevel=2)
     return dict(json.loads(text))
 
 
@@ -159,9 +165,8 @@ def _acting(act: Callable[[np.ndarray], ArrayLike]) -> Callable[[np.ndarray], np
     """Returns the function with its actions as float32."""
 
     def acting(observations: np.ndarray) -> np.ndarray:
-        actions = np.asarray(act(observations))
-        if actions.dtype.kind not in "fiub":
-            raise TypeError(f"actions must be numbers, not {actions.dtype}")
-        return actions.astype(np.float32, copy=False)
+        actions = floats("actions", act(observations))
+        most = np.finfo(np.float32).max
+        return np.clip(actions, -most, most)  # the environment clips further
 
     return acting

@@ -1,21 +1,26 @@
 """Gymnasium environments of the task: N that step together, or one."""
 from __future__ import annotations
 
+import hashlib
 import os
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Literal
 
 import gymnasium
 import numpy as np
 from gymnasium.error import ResetNeeded
-from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
+
+try:
+    from gymnasium.vector import AutoresetMode
+except ImportError:
+    raise ImportError(f"shadow_repose needs Gymnasium 1.1 or newer, this is {gymnasium.__version__}") from None
 
 from . import _native
 from ._policy import Policy
 from ._registration import register
-from ._settings import absolute, flat, number, pairs
+from ._settings import flat, floats, number, pairs
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -23,7 +28,11 @@ if TYPE_CHECKING:
 # The numbers by which the extension module reports an end.
 _TERMINATED, _TRUNCATED, _REDIRECTED = 1, 2, 3
 
-_STATE = ("numbers", "counters", "ends", "returns", "times")
+# The parts of a state, with their types and dimensions.
+_STATE = {
+    "numbers": (np.float64, 2), "counters": (np.uint64, 2), "ends": (np.uint8, 1), "returns": (np.float64, 1), "seeds": (np.uint64, 2),
+    "times": (np.uint64, 1),
+}  # fmt: skip
 
 
 class VectorEnv(gymnasium.vector.VectorEnv):
@@ -44,6 +53,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         random_age: the first episodes after a reset of all environments end early, at different times, as in `train`.
         autoreset_mode: when an environment starts its next episode (see Gymnasium). `"truncate"` needs SAME_STEP.
         reward_terms: `info["reward"]` holds the terms of each step's reward, which add up to it.
+        render_mode: `"rgb_array"` lets `render` draw pictures.
 
     Raises:
         ValueError: a setting is unknown or invalid, or the scene cannot be used. The message lists everything that is wrong.
@@ -53,7 +63,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
     actuator, and are clipped to [-1, 1]. Quaternions are w, x, y, z, and units are SI.
     """
 
-    metadata: dict[str, Any] = {"render_modes": [], "autoreset_mode": AutoresetMode.SAME_STEP}
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 100, "autoreset_mode": AutoresetMode.SAME_STEP}
 
     def __init__(
         self,
@@ -70,11 +80,11 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         random_age: bool = False,
         autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
         reward_terms: bool = False,
-        render_mode: None = None,
+        render_mode: Literal["rgb_array"] | None = None,
     ) -> None:
         self._hands: _native.Hands | None = None
-        if render_mode is not None:
-            raise ValueError(f"render_mode = {render_mode!r}: these hands cannot be rendered; evaluate(…, trace=…) writes what a page shows")
+        if render_mode not in (None, "rgb_array"):
+            raise ValueError(f'render_mode = {render_mode!r}: must be "rgb_array"; evaluate(…, trace=…) writes what a page shows')
         if goal_change not in ("continue", "truncate"):
             raise ValueError(f'goal_change = {goal_change!r}: must be "continue" or "truncate"')
         modes = {name: mode for mode in AutoresetMode for name in (mode.name, mode.value)}
@@ -83,22 +93,23 @@ class VectorEnv(gymnasium.vector.VectorEnv):
             raise ValueError(f"autoreset_mode = {autoreset_mode!r}: must be one of {', '.join(AutoresetMode.__members__)}")
         if goal_change == "truncate" and mode is not AutoresetMode.SAME_STEP:
             raise ValueError('goal_change = "truncate" needs autoreset_mode = SAME_STEP: the hand goes on under the new goal at once')
-        pairs(set), pairs(world)  # report wrong settings before anything is loaded
+        said = pairs(set), pairs(world)  # report wrong settings before anything is loaded
         if policy is not None and not isinstance(policy, Policy):
             of_task = {key: value for key, value in (set or {}).items() if key.split(".")[0] in ("env", "hand")}
-            policy = Policy.load(policy, set=of_task)
+            policy = Policy._loaded(policy, of_task)
         self._made: dict[str, Any] = {
-            "threads": number("threads", threads, most=65536), "seed": number("seed", seed), "set": absolute(set), "policy": policy,
-            "world": dict(world or {}),
-            "config": None if config is None else _found(os.fspath(config)), "training": bool(training),
+            "threads": number("threads", threads, most=65536), "seed": number("seed", seed), "training": bool(training),
             "mode": mode.value, "truncates": goal_change == "truncate", "terms": bool(reward_terms),
         }  # fmt: skip
         self.num_envs = number("num_envs", num_envs, 1, 65536)
-        hands = self._create()
+        native = None if policy is None else policy._native
+        hands = self._create((None if config is None else os.fspath(config), native, *said), None)
+        self._parts, self._task = hands.parts(), _identity(hands)
         for warning in hands.warnings:
             warnings.warn(warning, stacklevel=2)
-        self.metadata = {**self.metadata, "autoreset_mode": mode}
+        self.render_mode = render_mode
         self._aged, self.step_dt = bool(random_age), float(self.settings["env.ctrl_dt"])
+        self.metadata = {**self.metadata, "render_fps": round(1 / self.step_dt), "autoreset_mode": mode}
         layout = hands.layout()
         size = sum(length for _, _, length, _ in layout)
         self.observation_layout = {name: slice(first, first + length) for name, first, length, _ in layout}
@@ -108,20 +119,21 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
 
-    def _create(self) -> _native.Hands:
-        """Creates the environments anew."""
+    def _create(self, said: tuple[Any, ...], parts: tuple[Any, ...] | None) -> _native.Hands:
+        """Creates the environments from what the user says, or from the parts of others."""
         made = self._made
-        policy = None if made["policy"] is None else made["policy"]._native
-        settings = made["config"], policy, pairs(made["set"]), pairs(made["world"])
         how = made["training"], made["mode"], made["truncates"], made["terms"]
-        self._hands = _native.Hands(self.num_envs, made["threads"], made["seed"], *settings, *how)
+        self._hands = _native.Hands(self.num_envs, made["threads"], made["seed"], said, parts, *how)
         return self._hands
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
+    def reset(
+        self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
         """Starts an episode in each environment, and returns the observations `[N, O]` and an empty dict.
 
         Args:
-            seed: the episodes begin with the first one of this seed. Without a seed, the next episodes follow.
+            seed: the episodes begin with the first one of this seed. Without a seed, the next episodes follow. With a list of N seeds,
+                environment i plays what `Env` plays after `reset(seed=seed[i])`; where the list has None, the next episode follows.
             options: `{"reset_mask": mask}` with a bool array `[N]` restarts only the environments that it marks.
 
         Raises ValueError for a seed that is negative or comes with a mask, and for a mask of another shape.
@@ -129,7 +141,12 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         hands = self._open()
         if options is not None and not isinstance(options, Mapping):
             raise TypeError(f"options must be a dict, not {options!r}")
-        if seed is not None:
+        seeds = None
+        if np.ndim(seed) > 0:
+            seed, seeds = None, [None if one is None else number("seed", one) for one in seed]
+            if len(seeds) != self.num_envs:
+                raise ValueError(f"seed has {len(seeds)} seeds for {self.num_envs} hands")
+        elif seed is not None:
             seed = number("seed", seed)
             super().reset(seed=seed)
         mask = None if options is None else options.get("reset_mask")
@@ -141,7 +158,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
                 raise ValueError(f"reset_mask has the shape {mask.shape}, expected ({self.num_envs},)")
             if not mask.any():
                 raise ValueError("reset_mask marks no hand")
-        return hands.reset(seed, mask, self._aged), {}
+        return hands.reset(seed, seeds, mask, self._aged), {}
 
     def step(self, actions: ArrayLike) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Steps all environments once with `actions` `[N, A]`, which are clipped to [-1, 1].
@@ -208,22 +225,33 @@ class VectorEnv(gymnasium.vector.VectorEnv):
 
     def get_state(self) -> dict[str, np.ndarray]:
         """Returns the complete state of the environments, for `set_state` of environments with the same settings."""
-        return dict(zip(_STATE, self._open().state(), strict=True))
+        return {"task": self._task, **dict(zip(_STATE, self._open().state(), strict=True))}
 
     def set_state(self, state: Mapping[str, np.ndarray]) -> np.ndarray:
         """Continues from what `get_state` returned, bit for bit, and returns the observations `[N, O]` to act on.
 
-        Raises ValueError if it is the state of other environments.
+        Raises ValueError if it is the state of other environments: of another number of them, another scene, or other settings.
         """
-        types = (np.float64, np.uint64, np.uint8, np.float64, np.uint64)
         try:
-            parts = [np.asarray(state[name], kind) for name, kind in zip(_STATE, types, strict=True)]
+            parts = [np.asarray(state[name], kind) for name, (kind, _) in _STATE.items()]
+            task = state["task"]
         except KeyError as missing:
             raise ValueError(f"the state lacks {missing}") from None
-        shapes = [part.ndim for part in parts]
-        if shapes != [2, 2, 1, 1, 1]:
-            raise ValueError(f"the parts of the state have {shapes} dimensions, expected [2, 2, 1, 1, 1]")
+        dimensions = [part.ndim for part in parts]
+        expected = [count for _, count in _STATE.values()]
+        if dimensions != expected:
+            raise ValueError(f"the parts of the state have {dimensions} dimensions, expected {expected}")
+        if len(parts[0]) == self.num_envs and not np.array_equal(task, self._task):
+            raise ValueError("not a state of such hands: it belongs to other settings or to another scene")
         return self._open().set_state(*parts)
+
+    def render(self) -> tuple[np.ndarray, ...] | None:
+        """Returns a picture `[480, 640, 3]`, uint8, of each environment, or None without `render_mode="rgb_array"`.
+
+        It is drawn with EGL, as the films of the program. A randomised object is shown with the size that the task gives it. Raises
+        RuntimeError before a reset, and without EGL.
+        """
+        return None if self.render_mode is None else tuple(self._open().render())
 
     def close_extras(self, **kwargs: Any) -> None:
         """Frees the environments and their threads."""
@@ -242,7 +270,9 @@ class VectorEnv(gymnasium.vector.VectorEnv):
     def __setstate__(self, pickled: dict[str, Any]) -> None:
         self.__dict__.update(pickled)
         state = pickled["_hands"]
-        self._create()
+        hands = self._create((None, None, [], []), self._parts)
+        if not np.array_equal(_identity(hands), self._task):
+            raise ValueError("the copy would be another task: another MuJoCo, or a scene that reads a file which has changed")
         if state is not None:
             self.set_state(state)
 
@@ -250,20 +280,20 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         return f"<shadow_repose.VectorEnv of {self.num_envs} hands>"
 
 
-def _found(config: str) -> str:
-    """Returns the path of a file wherever the process goes. The program knows the files that come with it by their names."""
-    return os.path.abspath(config) if os.path.exists(config) else config
+def _identity(hands: _native.Hands) -> np.ndarray:
+    """Returns a checksum, uint8 `[32]`, of all settings and of the scene."""
+    found = hashlib.sha256(repr(hands.facts()).encode())
+    for _, content in hands.parts()[-1]:
+        found.update(hashlib.sha256(content).digest())
+    return np.frombuffer(found.digest(), np.uint8)
 
 
 def _numbers(actions: ArrayLike, shape: tuple[int, ...] | None) -> np.ndarray:
     """Returns the actions as float32."""
-    found = np.asarray(actions)
-    if found.dtype.kind not in "fiub":
-        raise TypeError(f"actions must be numbers, not {found.dtype}")
+    found = floats("actions", actions)
     if found.shape != shape:
         raise ValueError(f"actions have the shape {found.shape}, expected {shape}")
-    with np.errstate(over="ignore"):  # they are clipped anyway
-        return found.astype(np.float32, copy=False)
+    return found
 
 
 def _masked(values: dict[str, Any], mask: np.ndarray) -> dict[str, Any]:
@@ -282,7 +312,7 @@ class Env(gymnasium.Env):
     same as in `VectorEnv`. The attribute `vector` gives access to its settings, its layout and its state.
     """
 
-    metadata: dict[str, Any] = {"render_modes": []}
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 100}
 
     def __init__(
         self,
@@ -294,7 +324,7 @@ class Env(gymnasium.Env):
         policy: Policy | str | os.PathLike[str] | None = None,
         training: bool = False,
         reward_terms: bool = False,
-        render_mode: None = None,
+        render_mode: Literal["rgb_array"] | None = None,
     ) -> None:
         self.vector = VectorEnv(
             1, threads=1, seed=seed, config=config, set=set, world=world, policy=policy, training=training,
@@ -302,6 +332,8 @@ class Env(gymnasium.Env):
         )  # fmt: skip
         """The hand as a `VectorEnv` of one."""
         self.observation_space, self.action_space = self.vector.single_observation_space, self.vector.single_action_space
+        self.render_mode = render_mode
+        self.metadata = {**self.metadata, "render_fps": self.vector.metadata["render_fps"]}
         self._over = True
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
@@ -319,6 +351,11 @@ class Env(gymnasium.Env):
         observations, rewards, terminated, truncated, info = self.vector.step(_numbers(action, self.action_space.shape)[None])
         self._over = bool(terminated[0] or truncated[0])
         return observations[0], float(rewards[0]), bool(terminated[0]), bool(truncated[0]), _first(info)
+
+    def render(self) -> np.ndarray | None:
+        """Returns a picture `[480, 640, 3]`, uint8, or None without `render_mode="rgb_array"`."""
+        pictures = self.vector.render()
+        return None if pictures is None else pictures[0]
 
     def close(self) -> None:
         """Frees the environment."""

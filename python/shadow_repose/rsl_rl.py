@@ -57,14 +57,15 @@ class RslRlVecEnv(VecEnv):
     @episode_length_buf.setter
     def episode_length_buf(self, lengths: torch.Tensor) -> None:
         """Starts all environments again at random ages of their own choice, whatever the given lengths."""
-        self._start(self.envs._open().reset(None, None, True))
+        self._start(self.envs._open().reset(None, None, None, True))
 
     def _tensor(self, array: np.ndarray) -> torch.Tensor:
         return torch.from_numpy(array).to(self.device)
 
     def get_observations(self) -> TensorDict:
         """Returns the observations `[N, O]` to act on."""
-        return TensorDict({"policy": self._tensor(self._observations)}, batch_size=[self.num_envs], device=self.device)
+        observations = torch.tensor(self._observations, device=self.device)  # a copy
+        return TensorDict({"policy": observations}, batch_size=[self.num_envs], device=self.device)
 
     def step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict[str, Any]]:
         """Steps all environments once with `actions` `[N, A]`. Returns observations, rewards `[N]`, ends `[N]`, and what to log."""

@@ -31,7 +31,7 @@ class Sb3VecEnv(VecEnv):
     def __init__(self, envs: VectorEnv) -> None:
         if envs.metadata["autoreset_mode"] is not AutoresetMode.SAME_STEP:
             raise ValueError("Stable-Baselines3 needs hands with autoreset_mode = SAME_STEP")
-        self.envs, self.render_mode, self._began = envs, None, time.time()
+        self.envs, self.metadata, self._began = envs, envs.metadata, time.time()
         super().__init__(envs.num_envs, envs.single_observation_space, envs.single_action_space)
 
     def reset(self) -> np.ndarray:
@@ -83,5 +83,5 @@ class Sb3VecEnv(VecEnv):
         return [False] * self._count(indices)
 
     def get_images(self) -> Sequence[np.ndarray | None]:
-        """Returns no pictures."""
-        return [None] * self.num_envs
+        """Returns a picture of each environment, if they were made with `render_mode="rgb_array"`."""
+        return self.envs.render() or [None] * self.num_envs

@@ -1,29 +1,31 @@
 //! Environments that step together.
 
 use std::path::PathBuf;
-use std::sync::{Arc, Mutex, MutexGuard, TryLockError};
+use std::sync::{Mutex, MutexGuard, TryLockError};
 
 use anyhow::{Context, ensure};
 use numpy::{
-    IntoPyArray, PyArray1, PyArray2, PyArrayMethods, PyReadonlyArray1, PyReadonlyArray2,
+    IntoPyArray, PyArray1, PyArray2, PyArray3, PyArrayMethods, PyReadonlyArray1, PyReadonlyArray2,
     PyUntypedArrayMethods,
 };
 use pyo3::exceptions::{PyRuntimeError, PyValueError};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use rayon::prelude::*;
-use shadow_repose::config::Config;
+use shadow_repose::config::{Config, EnvConfig, PpoConfig};
 use shadow_repose::env::{Autoreset, End, EnvPool, EnvState};
 use shadow_repose::ranks::Exchange;
 use shadow_repose::repose::{
-    EpisodeStats, Lesson, Randomization, Repose, Task, TaskReward, TrainingReward, task_terms,
+    EpisodeStats, Lesson, Randomization, Repose, TaskReward, TrainingReward, task_terms,
     training_terms,
 };
+use shadow_repose::sim::mujoco_version;
 
 use crate::episodes::columns;
 use crate::errors::{guarded, refused};
+use crate::pictures::Painter;
 use crate::policy::Policy;
-use crate::settings::{Set, of_world, overrides, resolve, text};
+use crate::settings::{Made, Parts, Set, of_world, overrides, resolve, text};
 use crate::workers::Workers;
 
 /// The most environments, as in a training run.
@@ -32,8 +34,7 @@ const MOST_HANDS: usize = 65536;
 /// N environments of one task, with O values in an observation and A in an action.
 #[pyclass(frozen, module = "shadow_repose._native")]
 pub(crate) struct Hands {
-    task: Arc<Task>,
-    config: Config,
+    made: Made,
     training: bool,
     autoreset: Autoreset,
     /// Whether a new goal cuts off the return.
@@ -48,7 +49,7 @@ pub(crate) struct Hands {
 struct State {
     pool: EnvPool<Repose>,
     workers: Workers,
-    seed: u64,
+    painter: Option<Painter>,
     /// Control steps of all environments together. In a training they determine the lesson.
     env_steps: u64,
     /// The number of steps at which the current lesson began, if there is one.
@@ -59,6 +60,9 @@ struct State {
     returns: Vec<f64>,
     can_step: Result<(), &'static str>,
 }
+
+/// What the user says of the task: a settings file, a policy, settings, and settings of the world.
+type Said = (Option<PathBuf>, Option<Py<Policy>>, Set, Set);
 
 /// The ends, at the numbers that Python gets for them.
 const ENDS: [Option<End>; 4] = [
@@ -86,6 +90,24 @@ type Stepped<'py> = (
     Option<Terms<'py>>,
 );
 
+/// The task that the user says.
+///
+/// # Errors
+/// Fails if the settings are invalid, or if the scene cannot be used.
+fn made_of((config, policy, set, world): Said, training: bool) -> anyhow::Result<Made> {
+    let overrides = overrides(set, training)?;
+    let world = of_world(world)?;
+    let Some(policy) = policy else {
+        return resolve(config.as_deref(), &overrides, &world);
+    };
+    ensure!(
+        config.is_none(),
+        "give config or policy, not both: a policy brings the settings of its task"
+    );
+    let overrides = [overrides, world].concat();
+    policy.get().resolve(&overrides, training)
+}
+
 impl Hands {
     /// The locked state. Fails if it is in use or gone.
     fn locked(&self) -> PyResult<MutexGuard<'_, Option<State>>> {
@@ -106,7 +128,7 @@ impl Hands {
     }
 
     fn observation_size(&self) -> usize {
-        self.task.spaces().observation_size
+        self.made.task.spaces().observation_size
     }
 
     fn rows<'py>(&self, py: Python<'py>, rows: Vec<f32>) -> PyResult<Bound<'py, PyArray2<f32>>> {
@@ -117,8 +139,8 @@ impl Hands {
     /// The lesson after `env_steps`. Every goal that is reached ends with a redirection, which the caller may ignore.
     fn lesson(&self, env_steps: u64) -> Lesson {
         let mut lesson = match self.training {
-            true => Lesson::at(env_steps, &self.config),
-            false => Lesson::task(&self.task.config),
+            true => Lesson::at(env_steps, &self.made.config),
+            false => Lesson::task(&self.made.task.config),
         };
         lesson.goals_end = true;
         lesson
@@ -126,7 +148,7 @@ impl Hands {
 
     /// Starts the lesson that applies now. As in a training, it applies for the steps of an iteration.
     fn begin_lesson(&self, state: &mut State) {
-        let steps = |from| (self.config.ppo.horizon_at(from) * self.count) as u64;
+        let steps = |from| (self.made.config.ppo.horizon_at(from) * self.count) as u64;
         if state
             .lesson_from
             .is_none_or(|from| state.env_steps >= from.saturating_add(steps(from)))
@@ -290,6 +312,27 @@ impl State {
         Ok(())
     }
 
+    /// Lets the first episodes of `seed` start next, which the environments share among them.
+    fn seed_together(&mut self, seed: u64) {
+        let all = self.pool.count() as u64;
+        for member in self.pool.members_mut() {
+            member.seed = seed;
+            member.next_episode = member.number as u64;
+            member.stride = all;
+        }
+    }
+
+    /// Lets the first episode of its own seed start next in each environment that has one, and then the following ones.
+    fn seed_each(&mut self, seeds: Vec<Option<u64>>) {
+        for (member, seed) in self.pool.members_mut().zip(seeds) {
+            if let Some(seed) = seed {
+                member.seed = seed;
+                member.next_episode = 0;
+                member.stride = 1;
+            }
+        }
+    }
+
     fn started(&mut self, marked: &[bool]) {
         self.returns
             .iter_mut()
@@ -302,17 +345,15 @@ impl State {
 #[pymethods]
 impl Hands {
     #[new]
-    #[pyo3(signature = (count, threads, seed, config, policy, set, world, training, autoreset, truncates, terms))]
+    #[pyo3(signature = (count, threads, seed, said, parts, training, autoreset, truncates, terms))]
     #[expect(clippy::too_many_arguments, reason = "Python names each of them")]
     fn new(
         py: Python,
         count: usize,
         threads: usize,
         seed: u64,
-        config: Option<PathBuf>,
-        policy: Option<Py<Policy>>,
-        set: Set,
-        world: Set,
+        said: Said,
+        parts: Option<Parts>,
         training: bool,
         autoreset: &str,
         truncates: bool,
@@ -330,51 +371,40 @@ impl Hands {
         };
         let mut workers = Workers::new(threads);
         let made = workers.long(py, |stop| {
-            let overrides = overrides(set, training)?;
-            let world = of_world(world)?;
             ensure!(
                 (1..=MOST_HANDS).contains(&count),
                 "num_envs = {count}: must lie in [1, {MOST_HANDS}]"
             );
-            let (config, task) = match &policy {
-                None => resolve(config.as_deref(), &overrides, &world)?,
-                Some(policy) => {
-                    ensure!(
-                        config.is_none(),
-                        "give config or policy, not both: a policy brings the settings of its task"
-                    );
-                    policy
-                        .get()
-                        .resolve(&[overrides, world].concat(), training)?
-                }
+            let made = match parts {
+                Some(parts) => Made::of(parts)?,
+                None => made_of(said, training)?,
             };
             let randomization = if training {
-                Randomization::new(&task, &config.randomization)?
+                Randomization::new(&made.task, &made.config.randomization)?
             } else {
                 None
             };
             let hand = |_| {
                 let goes_on = !stop.load(std::sync::atomic::Ordering::Relaxed);
-                goes_on.then(|| Repose::randomized(&task, randomization.as_ref()))
+                goes_on.then(|| Repose::randomized(&made.task, randomization.as_ref()))
             };
             let hands: Option<Vec<Repose>> = (0..count).into_par_iter().map(hand).collect();
             let pool = EnvPool::new(seed, hands.context("interrupted")?, &Exchange::alone(1));
-            anyhow::Ok((config, task, pool))
+            anyhow::Ok((made, pool))
         })?;
-        let (config, task, pool) = made.map_err(refused)?;
+        let (made, pool) = made.map_err(refused)?;
         let state = State {
             pool,
             workers,
-            seed,
+            painter: None,
             env_steps: 0,
             lesson_from: None,
-            observations: vec![0.0; count * task.spaces().observation_size],
+            observations: vec![0.0; count * made.task.spaces().observation_size],
             returns: vec![0.0; count],
             can_step: Err(NOT_RESET),
         };
         Ok(Self {
-            task,
-            config,
+            made,
             training,
             autoreset,
             truncates,
@@ -386,7 +416,8 @@ impl Hands {
 
     /// The groups of an observation: (name, first index, length, unit).
     fn layout(&self) -> Vec<(&'static str, usize, usize, &'static str)> {
-        self.task
+        self.made
+            .task
             .hand
             .layout
             .groups
@@ -398,30 +429,73 @@ impl Hands {
     /// The number of values in an action.
     #[getter]
     fn action_size(&self) -> usize {
-        self.task.spaces().action_size
+        self.made.task.spaces().action_size
     }
 
     /// The length of an episode that no drop ends.
     #[getter]
     fn max_episode_steps(&self) -> u32 {
-        self.task.config.max_episode_steps()
+        self.made.task.config.max_episode_steps()
     }
 
     /// The settings of the task and the names of the hand's parts, as JSON.
     fn settings(&self) -> String {
-        text(&self.task)
+        text(&self.made.task)
+    }
+
+    /// All that they are made of, for a copy that needs no file.
+    fn parts(&self) -> Parts {
+        self.made.parts(&self.made.config)
+    }
+
+    /// What their task and its randomisation depend on, as texts.
+    fn facts(&self) -> Vec<String> {
+        let config = self.made.config.clone();
+        let known = Config::default();
+        let env = EnvConfig {
+            num_envs: known.env.num_envs,
+            ..config.env
+        };
+        let task = Config {
+            env,
+            hand: config.hand,
+            ..known
+        };
+        let whole = if self.training {
+            // Of a learner, a lesson depends on this alone.
+            let ppo = PpoConfig {
+                horizon: config.ppo.horizon,
+                ..task.ppo
+            };
+            Config {
+                ppo,
+                training: config.training,
+                randomization: config.randomization,
+                ..task
+            }
+        } else {
+            task
+        };
+        let (settings, _, record, predicted, _) = self.made.parts(&whole);
+        let fingerprint = self.made.task.scene.fingerprint();
+        let physics = format!("{} {fingerprint}", mujoco_version());
+        let others = [record, predicted].map(Option::unwrap_or_default);
+        [settings, physics, self.training.to_string()]
+            .into_iter()
+            .chain(others)
+            .collect()
     }
 
     /// Warnings where the policy does not fit well.
     #[getter]
     fn warnings(&self) -> Vec<String> {
-        self.task.warnings.to_vec()
+        self.made.task.warnings.to_vec()
     }
 
     /// What the settings replace in the user's scene, and what was found in it.
     #[getter]
     fn notes(&self) -> Vec<String> {
-        self.task.notes()
+        self.made.task.notes()
     }
 
     /// Whether the environments have been reset and no step has failed since.
@@ -447,11 +521,13 @@ impl Hands {
         Ok(())
     }
 
-    /// Starts episodes in the marked environments, or in all, then at random ages if `aged`. Returns all observations.
+    /// Starts episodes in the marked environments, or in all, then at random ages if `aged`. Returns all observations. A seed is for all
+    /// environments together. `seeds` are for each of them as if it was alone, and those without one go on.
     fn reset<'py>(
         &self,
         py: Python<'py>,
         seed: Option<u64>,
+        seeds: Option<Vec<Option<u64>>>,
         marked: Option<PyReadonlyArray1<'py, bool>>,
         aged: bool,
     ) -> PyResult<Bound<'py, PyArray2<f32>>> {
@@ -466,7 +542,7 @@ impl Hands {
             )));
         }
         let all = marked.iter().all(|marked| *marked);
-        if let (Some(_), false) = (seed, all) {
+        if (seed.is_some() || seeds.is_some()) && !all {
             return Err(PyValueError::new_err(
                 "a seed restarts all hands: give no seed with a reset_mask",
             ));
@@ -477,8 +553,10 @@ impl Hands {
             return Err(PyRuntimeError::new_err(reason));
         }
         if let Some(seed) = seed {
-            state.seed = seed;
-            state.pool.reseed(seed);
+            state.seed_together(seed);
+        }
+        if let Some(seeds) = seeds {
+            state.seed_each(seeds);
         }
         self.begin_lesson(state);
         let State {
@@ -569,8 +647,8 @@ impl Hands {
         ))
     }
 
-    /// The complete state of the environments: numbers `[N, k]`, counters `[N, m]`, ends `[N]` and returns `[N]`. The last array
-    /// holds the seed, the steps, and the steps at which the lesson began.
+    /// The complete state of the environments: numbers `[N, k]`, counters `[N, m]`, ends `[N]`, returns `[N]`, seeds `[N, 2]` with the
+    /// distances between the numbers of episodes. The last array holds the steps, and the steps at which the lesson began.
     #[expect(clippy::type_complexity, reason = "Python takes it apart")]
     fn state<'py>(
         &self,
@@ -580,6 +658,7 @@ impl Hands {
         Bound<'py, PyArray2<u64>>,
         Bound<'py, PyArray1<u8>>,
         Bound<'py, PyArray1<f64>>,
+        Bound<'py, PyArray2<u64>>,
         Bound<'py, PyArray1<u64>>,
     )> {
         let guard = self.locked()?;
@@ -592,6 +671,10 @@ impl Hands {
         } else {
             state.ends()
         };
+        let members = state.pool.blocks.iter().flat_map(|block| &block.members);
+        let seeds: Vec<u64> = members
+            .flat_map(|member| [member.seed, member.stride])
+            .collect();
         let wide = numbers.len() / self.count;
         let long = counters.len() / self.count;
         Ok((
@@ -599,8 +682,8 @@ impl Hands {
             counters.into_pyarray(py).reshape([self.count, long])?,
             ends.into_pyarray(py),
             state.returns.clone().into_pyarray(py),
+            seeds.into_pyarray(py).reshape([self.count, 2])?,
             vec![
-                state.seed,
                 state.env_steps,
                 state.lesson_from.unwrap_or(state.env_steps),
             ]
@@ -609,6 +692,7 @@ impl Hands {
     }
 
     /// Continues, bit for bit, from what `state` returned, and returns the observations `[N, O]` to act on.
+    #[expect(clippy::too_many_arguments, reason = "the parts of a state")]
     fn set_state<'py>(
         &self,
         py: Python<'py>,
@@ -616,6 +700,7 @@ impl Hands {
         counters: PyReadonlyArray2<'py, u64>,
         ends: PyReadonlyArray1<'py, u8>,
         returns: PyReadonlyArray1<'py, f64>,
+        seeds: PyReadonlyArray2<'py, u64>,
         times: PyReadonlyArray1<'py, u64>,
     ) -> PyResult<Bound<'py, PyArray2<f32>>> {
         let mut guard = self.locked()?;
@@ -627,7 +712,13 @@ impl Hands {
             .collect();
         let returns: Vec<f64> = returns.as_array().iter().copied().collect();
         let times: Vec<u64> = times.as_array().iter().copied().collect();
-        let rows = [numbers.shape()[0], counters.shape()[0], returns.len()];
+        let seeds: Vec<u64> = seeds.as_array().iter().copied().collect();
+        let rows = [
+            numbers.shape()[0],
+            counters.shape()[0],
+            returns.len(),
+            seeds.len() / 2,
+        ];
         let n = self.count;
         let saved = EnvState {
             numbers: numbers.as_array().iter().copied().collect(),
@@ -636,7 +727,7 @@ impl Hands {
         let restore = || {
             let ends = ends.context("an end is none of 0, 1, 2, 3")?;
             ensure!(
-                rows == [n; 3] && ends.len() == n,
+                rows == [n; 4] && ends.len() == n,
                 "it is the state of {} hands, these are {n}",
                 ends.len()
             );
@@ -646,22 +737,50 @@ impl Hands {
                 !due,
                 "there, hands wait for their next episode; here they never do (autoreset_mode)"
             );
-            let &[seed, env_steps, lesson_from] = times.as_slice() else {
-                anyhow::bail!("three numbers are missing")
+            let &[env_steps, lesson_from] = times.as_slice() else {
+                anyhow::bail!("it has {} times, not 2", times.len())
             };
             state.can_step = Err(NOT_SET);
             state.pool.set_lesson(self.lesson(lesson_from));
-            state.pool.reseed(seed);
-            state.seed = seed;
+            state.seed_together(0);
             state.env_steps = env_steps;
             state.lesson_from = Some(lesson_from);
             state.returns = returns;
-            state.restore(&saved, ends, self.observation_size())
+            state.restore(&saved, ends, self.observation_size())?;
+            let members = state.pool.members_mut().zip(seeds.chunks_exact(2));
+            for (member, seed) in members {
+                member.seed = seed[0];
+                member.stride = seed[1];
+            }
+            Ok(())
         };
         guarded(restore)?
             .context("not a state of such hands")
             .map_err(refused)?;
         self.rows(py, state.observations.clone())
+    }
+
+    /// A picture `[480, 640, 3]` of each environment as it is now. A randomised object is shown with the size that the task gives it.
+    fn render<'py>(&self, py: Python<'py>) -> PyResult<Vec<Bound<'py, PyArray3<u8>>>> {
+        let mut guard = self.locked()?;
+        let state = guard.as_mut().expect("not closed");
+        state.can_step.map_err(PyRuntimeError::new_err)?;
+        let State { pool, painter, .. } = state;
+        let draw = || -> anyhow::Result<Vec<Vec<u8>>> {
+            let painter = Painter::of_this_process(painter, &self.made.task)?;
+            let states = pool.envs_mut().map(|hand| hand.sim.state());
+            states.map(|state| painter.draw(state)).collect()
+        };
+        let pictures = py.detach(|| guarded(draw))?;
+        if pictures.is_err() {
+            *painter = None;
+        }
+        let pictures = pictures.map_err(|error| PyRuntimeError::new_err(format!("{error:#}")))?;
+        let [width, height] = Painter::SIZE.map(|pixels| pixels as usize);
+        pictures
+            .into_iter()
+            .map(|picture| picture.into_pyarray(py).reshape([height, width, 3]))
+            .collect()
     }
 
     /// Frees the environments and their threads.

@@ -7,10 +7,12 @@
 mod episodes;
 mod errors;
 mod hands;
+mod pictures;
 mod policy;
 mod settings;
 mod workers;
 
+use numpy::{IntoPyArray, PyArray1, PyReadonlyArray1};
 use pyo3::prelude::*;
 
 /// The module.
@@ -20,6 +22,8 @@ mod _native {
     use super::hands::Hands;
     #[pymodule_export]
     use super::policy::{Policy, evaluate};
+    #[pymodule_export]
+    use super::prepare;
     use super::{PyModule, PyResult, flush_before_the_end};
 
     #[pymodule_init]
@@ -27,6 +31,13 @@ mod _native {
         flush_before_the_end();
         Ok(())
     }
+}
+
+/// Takes from NumPy what the other functions need, and returns a new array. Once Python has begun to end, this is no longer possible.
+#[pyfunction]
+fn prepare<'py>(py: Python<'py>, array: PyReadonlyArray1<'py, f32>) -> Bound<'py, PyArray1<f32>> {
+    let values: Vec<f32> = array.as_array().to_vec();
+    values.into_pyarray(py)
 }
 
 /// A fatal error of MuJoCo ends the process, so what Python has buffered is written first.

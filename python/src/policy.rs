@@ -9,22 +9,23 @@ use numpy::{
     IntoPyArray, PyArray1, PyArray2, PyArrayMethods, PyReadonlyArray2, PyReadonlyArrayDyn,
     PyUntypedArrayMethods,
 };
-use pyo3::exceptions::PyValueError;
+use pyo3::exceptions::{PyRuntimeError, PyValueError};
 use pyo3::prelude::*;
-use shadow_repose::config::{Config, Override, Reader};
+use shadow_repose::config::{Override, Reader};
 use shadow_repose::evaluate::{Actor, Episodes, Trial};
 use shadow_repose::goal_times::GoalTimes;
-use shadow_repose::load::{self, Loaded};
+use shadow_repose::load::{self, Loaded, PolicySource};
 use shadow_repose::os::OutputFile;
 use shadow_repose::play::json_score;
-use shadow_repose::ppo::{self, GROUP};
-use shadow_repose::repose::{Score, Task};
+use shadow_repose::ppo::{self, Checkpoint, GROUP};
+use shadow_repose::repose::Score;
 use shadow_repose::run;
+use shadow_repose::sim::SceneFiles;
 use shadow_repose::spaces::Spaces;
 use shadow_repose::trace::Trace;
 
 use crate::errors::{guarded, refused};
-use crate::settings::{Set, overrides, resolve, text};
+use crate::settings::{Files, Made, Set, overrides, resolve, text};
 use crate::workers::Workers;
 
 /// The threads that compute large batches of actions.
@@ -37,6 +38,7 @@ pub(crate) struct Policy {
     /// The settings with which it was loaded.
     set: Vec<Override>,
     settings: String,
+    warnings: Vec<String>,
 }
 
 impl Policy {
@@ -45,15 +47,11 @@ impl Policy {
         [&self.set, overrides].concat()
     }
 
-    /// The settings and the task of environments for this policy. With `training`, nothing assists it, unless the user sets otherwise.
+    /// The task of environments for this policy. With `training`, nothing assists it, unless the user sets otherwise.
     ///
     /// # Errors
     /// Fails if the settings are invalid, or if the scene cannot be used.
-    pub(crate) fn resolve(
-        &self,
-        overrides: &[Override],
-        training: bool,
-    ) -> Result<(Config, Arc<Task>)> {
+    pub(crate) fn resolve(&self, overrides: &[Override], training: bool) -> Result<Made> {
         let overrides = self.with(overrides);
         let is_of_task =
             |set: &&Override| matches!(set.key.split('.').next(), Some("env" | "hand"));
@@ -72,15 +70,9 @@ impl Policy {
                 &overrides,
             )?
         } else {
-            Config::default()
+            self.loaded.settings(&of_task)?
         };
-        Ok((
-            Config {
-                env: task.config.clone(),
-                ..whole
-            },
-            task,
-        ))
+        Ok(Made::new(whole, task, Some(self.loaded.record.clone())))
     }
 
     /// Computes rows of `width` values for the observations.
@@ -118,17 +110,33 @@ impl Policy {
 
 #[pymethods]
 impl Policy {
-    /// Loads a built-in policy by its name, a policy file, or the best policy of a run folder.
+    /// Loads a built-in policy by its name, a policy file, or the best policy of a run folder. A copy has the content of a file, and the
+    /// files of its scene.
     #[new]
-    fn new(py: Python, place: PathBuf, set: Set) -> PyResult<Self> {
+    #[pyo3(signature = (place, set, content = None, files = Files::new()))]
+    fn new(
+        py: Python,
+        place: PathBuf,
+        set: Set,
+        content: Option<Vec<u8>>,
+        files: Files,
+    ) -> PyResult<Self> {
         let load = || {
             let set = overrides(set, false)?;
-            let loaded = Loaded::find(Some(&place), &set)?;
-            let settings = text(&*loaded.task(&set)?);
+            let mut loaded = match content {
+                None => Loaded::find(Some(&place), &set)?,
+                Some(bytes) => {
+                    Loaded::new(PolicySource::File(place), Checkpoint::parse(&bytes)?, &set)?
+                }
+            };
+            loaded.files = Arc::new(SceneFiles(files));
+            let task = loaded.task(&set)?;
+            loaded.files = task.files().clone();
             anyhow::Ok(Self {
                 loaded,
                 set,
-                settings,
+                settings: text(&task),
+                warnings: task.warnings.clone(),
             })
         };
         py.detach(|| guarded(load))?.map_err(refused)
@@ -140,15 +148,22 @@ impl Policy {
         &self.loaded.name
     }
 
-    /// Where it was found: the name of a built-in policy, or its file.
+    /// Warnings where it does not fit its task well.
     #[getter]
-    fn place(&self) -> PathBuf {
-        let path = self.loaded.origin.path();
-        if self.loaded.origin.file().is_some() {
-            std::path::absolute(path).unwrap_or(path.into())
-        } else {
-            path.into()
-        }
+    fn warnings(&self) -> Vec<String> {
+        self.warnings.clone()
+    }
+
+    /// All that a copy is made of: the name of a built-in policy, or its file with the content, and the files of its scene.
+    fn parts(&self) -> PyResult<(PathBuf, Option<Vec<u8>>, Files)> {
+        let loaded = &self.loaded;
+        let content = loaded.origin.file();
+        let content = content.map(|_| loaded.checkpoint.policy_alone().to_bytes());
+        Ok((
+            loaded.origin.path().into(),
+            content.transpose().map_err(refused)?,
+            loaded.files.0.clone(),
+        ))
     }
 
     /// The settings of its task, as JSON.
@@ -190,15 +205,6 @@ impl Policy {
     }
 }
 
-/// Who is scored.
-#[derive(FromPyObject)]
-pub(crate) enum Scored {
-    /// A policy of the program.
-    Policy(Py<Policy>),
-    /// A function that returns the actions `[N, A]`, float32, for the observations `[N, O]`.
-    Function(Py<PyAny>),
-}
-
 /// Lets the function write `actions`, a row for each row of observations. At an exception it sets `stop`.
 fn ask(
     act: &Py<PyAny>,
@@ -208,7 +214,7 @@ fn ask(
 ) -> PyResult<()> {
     let size = spaces.action_size;
     let rows = actions.len() / size;
-    let asked = Python::attach(|py| {
+    let asked = Python::try_attach(|py| {
         let seen = observations
             .to_vec()
             .into_pyarray(py)
@@ -227,43 +233,41 @@ fn ask(
             .for_each(|(action, chosen)| *action = *chosen);
         Ok(())
     });
+    let ended = || Err(PyRuntimeError::new_err("Python has ended"));
+    let asked = asked.unwrap_or_else(ended);
     stop.fetch_or(asked.is_err(), Ordering::Relaxed);
     asked
 }
 
-/// The score that `play --json` prints, as JSON. The first episodes are written to the file `trace`.
+/// The score that `play --json` prints, as JSON, and warnings about it. Who is scored is a policy, or a function that returns the actions
+/// `[N, A]`, float32, for the observations `[N, O]`. The first episodes are written to the file `trace`.
 #[pyfunction]
 pub(crate) fn evaluate(
     py: Python,
-    scored: Scored,
+    scored: Py<PyAny>,
     set: Set,
     episodes: usize,
     seed: u64,
     threads: usize,
     trace: Option<PathBuf>,
-) -> PyResult<String> {
+) -> PyResult<(String, Vec<String>)> {
     let most = 1 << 20;
     if !(1..=most).contains(&episodes) {
         return Err(PyValueError::new_err(format!(
             "episodes = {episodes}: must lie in [1, {most}]"
         )));
     }
+    let policy = scored.cast_bound::<Policy>(py).ok().map(Bound::get);
     let raised = Mutex::new(None);
     let played = Workers::new(threads).long(py, |stop| {
         let set = overrides(set, false)?;
-        let loaded = match &scored {
-            Scored::Policy(policy) => Some(policy.get()),
-            Scored::Function(_) => None,
-        };
-        let task = match loaded {
+        let task = match policy {
             Some(policy) => policy.loaded.task(&policy.with(&set))?,
-            None => resolve(None, &set, &[])?.1,
+            None => resolve(None, &set, &[])?.task,
         };
-        let loaded = loaded.map(|policy| &policy.loaded);
+        let loaded = policy.map(|policy| &policy.loaded);
         let outside = |observations: &[f32], actions: &mut [f32]| {
-            if let Scored::Function(act) = &scored
-                && let Err(error) = ask(act, task.spaces(), (observations, actions), stop)
-            {
+            if let Err(error) = ask(&scored, task.spaces(), (observations, actions), stop) {
                 raised
                     .lock()
                     .expect("no panic while it is held")
@@ -303,15 +307,15 @@ pub(crate) fn evaluate(
         .map_or_else(|| played.map_err(refused), Err)
 }
 
-/// Plays the episodes, and writes the first ones to the file `trace`. The result is their score as JSON, or nothing if they were
-/// stopped or have `failed`.
+/// Plays the episodes, and writes the first ones to the file `trace`. The result is their score as JSON, and warnings, or nothing if they
+/// were stopped or have `failed`.
 fn played(
     trial: &Trial,
     seed: u64,
     checkpoint: Option<&str>,
     trace: Option<&Path>,
     failed: &dyn Fn() -> bool,
-) -> anyhow::Result<String> {
+) -> Result<(String, Vec<String>)> {
     let config = &trial.task.config;
     let output = trace.map(OutputFile::create).transpose()?;
     let mut output = output.map(|file| {
@@ -329,11 +333,14 @@ fn played(
         Ok(())
     })?;
     let Some(played) = played.filter(|_| !failed()) else {
-        return Ok(String::new());
+        return Ok(Default::default());
     };
     if let Some((file, trace)) = output {
         file.finish(trace.finish().as_bytes())?;
     }
     let score = Score::of(&played, config.ctrl_dt);
-    Ok(json_score(&score, &goal_times, checkpoint, seed).to_string())
+    let warnings = trial.task.warnings.iter().cloned();
+    let warnings = warnings.chain(score.divergence()).collect();
+    let json = json_score(&score, &goal_times, checkpoint, seed);
+    Ok((json.to_string(), warnings))
 }

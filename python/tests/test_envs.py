@@ -356,7 +356,7 @@ def test_one_hand_is_a_gymnasium_environment():
         ({"autoreset_mode": "never"}, ValueError, "SAME_STEP"),
         ({"autoreset_mode": [1]}, ValueError, "SAME_STEP"),
         ({"policy": "zero"}, FileNotFoundError, "zero"),
-        ({"render_mode": "human"}, ValueError, "cannot be rendered"),
+        ({"render_mode": "human"}, ValueError, "must be .rgb_array"),
         ({"nonsense": 1}, TypeError, "nonsense"),
     ],
 )

@@ -6,17 +6,34 @@ import gymnasium
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
-from gymnasium.vector import AutoresetMode
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers import vector as wrappers
 
-from shadow_repose import VectorEnv
+from shadow_repose import Env, VectorEnv
 
 SHORT = {"env.max_episode_seconds": 0.2}
+
+
+def draws():
+    """Whether pictures can be drawn here."""
+    envs = VectorEnv(1, render_mode="rgb_array")
+    envs.reset()
+    try:
+        return bool(envs.render())
+    except RuntimeError as error:
+        assert "EGL" in str(error)
+        return False
+
+
+DRAWS = draws()
+drawn = pytest.mark.skipif(not DRAWS, reason="pictures cannot be drawn here")
 
 
 @pytest.mark.filterwarnings("ignore:.*Box observation space.*", "ignore:.*not within.*")
 def test_one_hand_passes_the_check_of_environments():
     check_env(gymnasium.make("ShadowRepose-v0", set=SHORT).unwrapped, skip_render_check=True)
+    if DRAWS:
+        check_env(gymnasium.make("ShadowRepose-v0", set=SHORT, render_mode="rgb_array").unwrapped)
 
 
 def test_many_hands_are_made_by_name():
@@ -98,3 +115,92 @@ def test_infos_become_lists_with_the_episode_of_each_hand():
     for _ in range(3):
         *_, infos = envs.step(np.zeros((3, 20)))
     assert infos[1]["final_info"]["episode"]["l"] == 3 and infos[2]["final_obs"].shape == envs.single_observation_space.shape
+
+
+def test_a_list_of_seeds_is_taken_as_by_gymnasiums_own_vector_environments():
+    made = {"set": {"env.max_episode_seconds": 0.05, "env.fall_dist": 10.0}, "autoreset_mode": "NextStep"}
+    ours, theirs = VectorEnv(3, **made), SyncVectorEnv([lambda: Env(set=made["set"])] * 3)
+    for seeds in ([7, 3, 7], np.array([1, 2, 3]), (np.int64(5), 6, 2**64 - 1)):
+        assert np.array_equal(ours.reset(seed=seeds)[0], theirs.reset(seed=[int(seed) for seed in seeds])[0])
+        for step, given in enumerate(np.random.default_rng(0).uniform(-1, 1, (20, 3, 20)).astype(np.float32)):
+            found, expected = ours.step(given), theirs.step(given)
+            assert all(np.array_equal(one, other) for one, other in zip(found[:4], expected[:4], strict=True)), step
+            if step == 8:
+                again = VectorEnv(3, **made)
+                assert np.array_equal(again.set_state(ours.get_state()), found[0])
+    for given in np.zeros((12, 3, 20), np.float32):
+        expected = theirs.step(given)[0]
+        assert np.array_equal(ours.step(given)[0], expected)
+
+
+def test_a_seed_for_some_environments_lets_the_others_go_on():
+    envs, others = VectorEnv(3, seed=1), VectorEnv(3, seed=1)
+    first, second = others.reset()[0], others.reset()[0]
+    assert np.array_equal(envs.reset()[0], first)
+    found = envs.reset(seed=[None, 4, None])[0]
+    assert np.array_equal(found[[0, 2]], second[[0, 2]]) and np.array_equal(found[1], VectorEnv(1).reset(seed=4)[0][0])
+    assert np.array_equal(envs.reset(seed=1)[0], first) and np.array_equal(envs.reset()[0], second)
+    for wrong, error in [([1, 2], ValueError), ([1, 2, -1], ValueError), ([1, 2, 2.5], TypeError), ("abc", TypeError), ([[1], [2], [3]], TypeError)]:
+        with pytest.raises(error, match="seed"):
+            envs.reset(seed=wrong)
+    with pytest.raises(ValueError, match="give no seed"):
+        envs.reset(seed=[1, 2, 3], options={"reset_mask": np.array([True, False, False])})
+
+
+@drawn
+def test_pictures_show_each_environment_as_it_is():
+    envs = VectorEnv(2, seed=3, render_mode="rgb_array")
+    with pytest.raises(RuntimeError, match="reset the hands"):
+        envs.render()
+    envs.reset()
+    one, other = envs.render()
+    assert (one.shape, one.dtype) == ((480, 640, 3), np.uint8) and one.std() > 10 and (one != other).any()
+    assert np.abs(one - envs.render()[0].astype(int)).max() <= 1
+    for _ in range(10):
+        envs.step(np.ones((2, 20)))
+    assert (envs.render()[0] != one).any()
+    assert VectorEnv(1).render() is None
+    env = gymnasium.make("ShadowRepose-v0", render_mode="rgb_array")
+    env.reset(seed=1)
+    assert env.render().shape == (480, 640, 3) and env.metadata["render_fps"] == 100
+
+
+@drawn
+def test_a_drawing_does_not_change_what_comes():
+    seen, unseen = VectorEnv(2, seed=3, render_mode="rgb_array"), VectorEnv(2, seed=3)
+    seen.reset(), unseen.reset()
+    for given in np.random.default_rng(1).uniform(-1, 1, (5, 2, 20)):
+        seen.render()
+        assert np.array_equal(seen.step(given)[0], unseen.step(given)[0])
+
+
+@drawn
+def test_gymnasium_records_a_film(tmp_path):
+    pytest.importorskip("moviepy")
+    env = gymnasium.make("ShadowRepose-v0", render_mode="rgb_array", set=SHORT)
+    film = gymnasium.wrappers.RecordVideo(env, str(tmp_path / "films"), episode_trigger=lambda episode: True)
+    film.reset(seed=1)
+    while not any(film.step(np.ones(20))[2:4]):
+        pass
+    film.close()
+    [file] = (tmp_path / "films").iterdir()
+    from moviepy import VideoFileClip
+
+    with VideoFileClip(str(file)) as clip:
+        assert clip.size == [640, 480] and clip.fps == 100 and abs(clip.duration - 0.21) < 0.03
+
+
+@drawn
+def test_gymnasium_collects_the_pictures_of_an_episode():
+    env = gymnasium.wrappers.RenderCollection(gymnasium.make("ShadowRepose-v0", render_mode="rgb_array", set=SHORT))
+    env.reset(seed=1)
+    for _ in range(4):
+        env.step(np.ones(20))
+    pictures = env.render()
+    assert len(pictures) == 5 and all((one != other).any() for one, other in zip(pictures, pictures[1:]))
+
+
+def test_a_gymnasium_that_is_too_old_is_named_with_the_version_that_is_needed():
+    code = "import gymnasium.vector; del gymnasium.vector.AutoresetMode; gymnasium.__version__ = '1.0.0'; import shadow_repose.envs"
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert found.stderr.splitlines()[-1] == "ImportError: shadow_repose needs Gymnasium 1.1 or newer, this is 1.0.0"

@@ -50,4 +50,7 @@ def test_rsl_rl_learns():
     runner = runners.OnPolicyRunner(envs, config, log_dir=None, device="cpu")
     runner.learn(20, init_at_random_ep_len=True)
     assert envs.envs.env_steps == 20 * 8 * 64 and envs.episode_length_buf.max() < 31
+    kept = envs.get_observations()["policy"].clone()
+    envs.get_observations()["policy"].fill_(7)
+    assert (envs.get_observations()["policy"] == kept).all()
     envs.close()

@@ -1,9 +1,7 @@
 """Policies and their scores."""
-import copy
 import json
 import pathlib
 import pickle
-import shutil
 import subprocess
 import time
 
@@ -40,20 +38,6 @@ def test_drawn_actions_spread_around_the_means_and_follow_the_generator():
     assert policy.std.shape == (20,)
 
 
-def test_a_policy_is_pickled_by_its_place_and_recognised(tmp_path):
-    policy, seen = Policy.load("robust"), observations(3)
-    again = pickle.loads(pickle.dumps(policy))
-    assert np.array_equal(again(seen), policy(seen)) and "robust" in repr(again)
-    assert copy.deepcopy(policy) is policy
-    assets, file = pathlib.Path(__file__).parent.parent.parent / "assets/policies", tmp_path / "policy.safetensors"
-    shutil.copy(assets / "robust.safetensors", file)
-    pickled = pickle.dumps(Policy.load(file))
-    assert np.array_equal(pickle.loads(pickled)(seen), policy(seen))
-    shutil.copy(assets / "repose.safetensors", file)
-    with pytest.raises(ValueError, match="another policy"):
-        pickle.loads(pickled)
-
-
 def test_a_policy_file_is_loaded_with_its_settings(tmp_path):
     with pytest.raises(FileNotFoundError, match="nowhere"):
         Policy.load(tmp_path / "nowhere")
@@ -71,7 +55,13 @@ def test_a_policy_file_is_loaded_with_its_settings(tmp_path):
     assert evaluate(slippery, **short) != evaluate("builtin", **short)
 
 
-@pytest.mark.parametrize("given", [np.zeros((3, SIZE - 1)), np.zeros((2, 3, SIZE)), "x", None, [[1], [2, 3]], 3.0])
+@pytest.mark.parametrize(
+    "given",
+    [
+        np.zeros((3, SIZE - 1)), np.zeros((2, 3, SIZE)), "x", None, [[1], [2, 3]], 3.0, np.zeros((1, SIZE), complex), ["1"] * SIZE,
+        np.zeros((1, SIZE), "M8[s]"), [None] * SIZE, np.zeros((1, SIZE), object), np.zeros((1, SIZE), "m8[s]"),
+    ],
+)  # fmt: skip
 def test_what_is_no_observation_is_an_exception(given):
     with pytest.raises((TypeError, ValueError)):
         Policy.load("builtin")(given)
@@ -149,3 +139,40 @@ def test_names_are_listed_and_unknown_ones_refused():
     assert set(shadow_repose.__all__) <= set(dir(shadow_repose))
     with pytest.raises(AttributeError, match="nonsense"):
         shadow_repose.nonsense
+
+
+def test_actions_that_are_too_large_are_clipped_in_an_evaluation_as_in_a_step():
+    short = {"episodes": 3, "set": {"env.max_episode_seconds": 0.1}}
+    expected = evaluate(lambda seen: np.sign(seen[:, :20]), **short)
+    for most in (np.inf, 1e300, 1e30):
+        assert evaluate(lambda seen: np.select([seen[:, :20] > 0, seen[:, :20] < 0], [most, -most], 0.0), **short) == expected
+
+
+@pytest.fixture
+def other_ranges(tmp_path):
+    """The built-in scene with another range of an actuator."""
+    text = (pathlib.Path(__file__).parent.parent.parent / "assets/shadow_hand/scene.xml").read_text()
+    before = '<position name="rh_A_THJ3"'
+    assert before in text
+    scene = tmp_path / "hand.xml"
+    scene.write_text(text.replace(before, before + ' inheritrange="0" ctrlrange="-.1 .1"'))
+    return {"env.model": scene, "env.max_episode_seconds": 0.05}
+
+
+def test_a_warning_about_a_policy_is_said_at_every_door(other_ranges, tmp_path):
+    said = "an action means another angle than in training.*rh_A_THJ3"
+    loaded = Policy.load("builtin")
+    for door in (
+        lambda: Policy.load("builtin", set=other_ranges),
+        lambda: VectorEnv(1, policy="builtin", set=other_ranges),
+        lambda: VectorEnv(1, policy=loaded, set=other_ranges),
+        lambda: evaluate("builtin", set=other_ranges, episodes=1),
+        lambda: evaluate(loaded, set=other_ranges, episodes=1),
+    ):
+        with pytest.warns(UserWarning, match=said) as warnings:
+            door()
+        assert len(warnings) == 1 and warnings[0].filename == __file__
+    sets = [f"--set={key}={value}" for key, value in other_ranges.items()]
+    for command in (["export", "--ckpt", "builtin", "--out", "x.onnx"], ["play", "--ckpt", "builtin", "--json", "--episodes", "1"]):
+        found = subprocess.run([program(), *command, *sets], cwd=tmp_path, capture_output=True, text=True, check=True)
+        assert "warning: an action means another angle than in training" in found.stderr

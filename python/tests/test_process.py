@@ -199,3 +199,37 @@ def test_a_processor_without_avx_is_named_in_a_sentence(tmp_path):
     facts.write_text("processor : 0\nflags : fpu sse2 avx avx2\n")
     shadow_repose._expect_avx(str(facts))
     shadow_repose._expect_avx(str(tmp_path / "nowhere"))
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        "envs.step(zeros)", "envs.reset()", "envs.get_state()", "envs.set_state(state)", "policy(seen)", "policy(seen[:1])", "policy.values(seen)",
+        "evaluate(policy, episodes=1)", "evaluate(lambda seen: seen[:, :20], episodes=1)", "VectorEnv(2)", "Policy.load()",
+        "pickle.loads(pickle.dumps(policy))", "copy.deepcopy(envs)", "envs.render()", "envs.close()",
+    ],
+)  # fmt: skip
+@pytest.mark.parametrize("used", [False, True])
+def test_a_call_while_python_ends_is_answered_or_an_ordinary_exception(call, used):
+    code = f"""
+import copy, pickle, numpy as np
+from shadow_repose import Policy, VectorEnv, evaluate
+envs, policy = VectorEnv(2, render_mode="rgb_array"), Policy.load()
+zeros, seen = np.zeros((2, 20), np.float32), np.zeros((200, *envs.single_observation_space.shape), np.float32)
+envs.reset()
+state = envs.get_state()
+
+class Late:
+    def __del__(self):
+        try:
+            {call}
+        except Exception:
+            pass
+
+if {used}:
+    Late().__del__()
+late = Late()
+"""
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+    assert (found.returncode, found.stdout) == (0, "") and "panicked" not in found.stderr, found.stderr
+    assert not found.stderr or "note:" in found.stderr, found.stderr

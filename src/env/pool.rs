@@ -55,10 +55,11 @@ pub struct Member<E: Env> {
     /// Its number, counted over all ranks.
     pub number: usize,
     /// The seed of its episodes.
-    seed: u64,
-    next_episode: u64,
-    /// The number of all environments, by which the numbers of its episodes increase.
-    stride: u64,
+    pub seed: u64,
+    /// The number of its next episode.
+    pub next_episode: u64,
+    /// By how much the numbers of its episodes increase: the number of all environments, unless its seed is its own.
+    pub stride: u64,
 }
 
 impl<E: Env> EnvPool<E> {
@@ -137,14 +138,6 @@ impl<E: Env> EnvPool<E> {
                     .zip(rows)
                     .for_each(|(member, row)| member.restart(true, row));
             });
-    }
-
-    /// Makes the first episodes of `seed` start next.
-    pub fn reseed(&mut self, seed: u64) {
-        for member in self.members_mut() {
-            member.seed = seed;
-            member.next_episode = member.number as u64;
-        }
     }
 
     /// Starts the next episode of each environment that is `marked`, at a random age if `aged`, and writes its row of the

@@ -27,9 +27,7 @@ pub fn export(args: &ExportArgs) -> Result<()> {
     let task = loaded
         .task(&args.set)
         .context("the file needs the actuator ranges of the scene")?;
-    task.warnings
-        .iter()
-        .for_each(|warning| say!("warning: {warning}"));
+    task.say_warnings();
     task.notes().iter().for_each(|note| say!("note: {note}"));
     expect_finite_actions(&task, &loaded.policy)
         .with_context(|| format!("cannot export {}", loaded.origin))?;

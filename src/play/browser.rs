@@ -22,9 +22,8 @@ const BUILT_IN: &str = "built into the program";
 
 /// What a page says about who acts in episodes that are drawn from this seed.
 pub fn about(stage: &Stage, seed: u64) -> About {
-    let policy = stage
-        .loaded()
-        .map(|loaded| (loaded.origin.to_string(), &*loaded.name));
+    let name = stage.described();
+    let policy = stage.origin().zip(name.as_deref());
     described(stage.actor().name(), policy, Some(seed))
 }
 

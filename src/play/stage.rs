@@ -45,11 +45,7 @@ impl Stage {
         if let Some(loaded) = stage.loaded().filter(|_| !args.json) {
             say!("playing {}", loaded.name);
         }
-        stage
-            .task
-            .warnings
-            .iter()
-            .for_each(|warning| say!("warning: {warning}"));
+        stage.task.say_warnings();
         if !args.json {
             stage
                 .task
@@ -121,9 +117,17 @@ impl Stage {
             .unwrap_or_else(|| self.actor().name().to_owned())
     }
 
+    /// What a page says of the policy: its description, and where it does not fit well.
+    pub fn described(&self) -> Option<String> {
+        let loaded = self.loaded()?;
+        let warnings = self.task.warnings.iter();
+        let warnings = warnings.map(|warning| format!("; warning: {warning}"));
+        Some(loaded.name.clone() + &warnings.collect::<String>())
+    }
+
     /// The actor of a page that shows this task.
     pub fn acting(self: Rc<Self>, task: Arc<Task>) -> LiveActor {
-        let policy = self.loaded().map(|loaded| loaded.name.clone());
+        let policy = self.described();
         let step = move |player: &mut Player| {
             let (_, actor) = &self.actors_of(Policy::freeze_briefly)[self.choice];
             player.step(actor)

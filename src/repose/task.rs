@@ -13,7 +13,7 @@ use super::{Hand, Record};
 use crate::config::{Config, EnvConfig, FARTHEST};
 use crate::os;
 use crate::quat::CUBE_ROTATIONS;
-use crate::sim::{Compilation, Look, Parts, Scene, origin};
+use crate::sim::{Compilation, Look, Parts, Scene, SceneFiles, origin};
 use crate::spaces::Spaces;
 
 /// The name of the body that shows the goal where a scene has none.
@@ -49,16 +49,28 @@ impl Task {
     /// # Errors
     /// Fails with the scene's file if the scene cannot be loaded or lacks something, or if a setting does not fit the hand.
     pub fn new(all: &Config) -> Result<Arc<Self>> {
+        Self::with_files(all, &Arc::default())
+    }
+
+    /// Loads the scene that `all` settings name, from `known` files if they are those of this scene, and binds the hand in it.
+    ///
+    /// # Errors
+    /// Fails as [`Task::new`] does.
+    pub fn with_files(all: &Config, known: &Arc<SceneFiles>) -> Result<Arc<Self>> {
         let file = all.env.model_file();
         let mut config = all.env.clone();
-        let as_it_is = Scene::load(file, &Compilation::plain(config.sim_dt, config.cone))?;
+        let plain = Compilation {
+            files: known.or_read(file),
+            ..Compilation::plain(config.sim_dt, config.cone)
+        };
+        let as_it_is = Scene::load(file, &plain)?;
         let mut parts = Hand::find(&as_it_is, &all.hand).with_context(|| origin(file))?;
         let compilation = Compilation {
             object: parts.object.clone(),
             size: config.cube_size_scale,
             shifts: config.cube_com != [0.0; 3],
             adds_goal: parts.goal.is_empty().then_some(GOAL),
-            ..Compilation::plain(config.sim_dt, config.cone)
+            ..plain
         };
         if parts.goal.is_empty() {
             parts.goal = GOAL.into();
@@ -125,6 +137,11 @@ impl Task {
             hand,
             ..self.clone()
         }))
+    }
+
+    /// Its scene in memory.
+    pub fn files(&self) -> &Arc<SceneFiles> {
+        &self.compilation.files
     }
 
     /// The same task at the stage of a run in which `other` is: its actions are smoothed as there.
@@ -208,6 +225,13 @@ impl Task {
             ),
         });
         notes
+    }
+
+    /// Tells the user where the policy does not fit well.
+    pub fn say_warnings(&self) {
+        self.warnings
+            .iter()
+            .for_each(|warning| os::say!("warning: {warning}"));
     }
 
     /// A table of what was found in the scene, and in what order.

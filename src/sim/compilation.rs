@@ -9,6 +9,7 @@ use std::ffi::{CStr, CString};
 use std::fmt::Display;
 use std::path::Path;
 use std::ptr;
+use std::sync::Arc;
 
 use anyhow::{Context, Error, Result, anyhow, bail, ensure};
 use mujoco_rs::mujoco_c::{mj_deleteSpec, mj_parseXML};
@@ -17,6 +18,7 @@ use mujoco_rs::wrappers::SpecItem;
 use mujoco_rs::wrappers::mj_editing::{MjsBody, MjsGeom};
 use serde::{Deserialize, Serialize};
 
+use super::SceneFiles;
 use super::constants::*;
 use super::placing::{frames_within, geoms_within};
 use crate::quat;
@@ -55,6 +57,8 @@ pub struct Compilation {
     pub shifts: bool,
     /// The name of a mocap body that is added to show the goal: it looks like the object, and touches nothing.
     pub adds_goal: Option<&'static str>,
+    /// The scene in memory. What is not there is read from its file.
+    pub files: Arc<SceneFiles>,
 }
 
 impl Compilation {
@@ -67,6 +71,7 @@ impl Compilation {
             size: 1.0,
             shifts: false,
             adds_goal: None,
+            files: Arc::default(),
         }
     }
 
@@ -85,10 +90,19 @@ impl Compilation {
             "env.model must name a MuJoCo scene, but this is a folder"
         );
         ensure!(
-            file.is_none_or(Path::is_file),
+            file.is_none_or(|file| self.files.hold(file) || file.is_file()),
             "env.model must name a MuJoCo scene, but there is no such file"
         );
-        self.spec(file)?.compile().map_err(refused)
+        self.finish(self.spec(file)?)
+    }
+
+    /// Compiles a scene that was read.
+    ///
+    /// # Errors
+    /// Fails with MuJoCo's own message if MuJoCo refuses the scene.
+    pub(super) fn finish(&self, mut spec: MjSpec) -> Result<MjModel> {
+        spec.compile_with_vfs(&self.files.for_mujoco())
+            .map_err(refused)
     }
 
     /// Reads a scene that is about to be compiled, and resizes its object.
@@ -96,7 +110,10 @@ impl Compilation {
     /// # Errors
     /// Fails if MuJoCo cannot read the scene, if it has no such body, or if the body has a mesh.
     pub(super) fn spec(&self, file: Option<&Path>) -> Result<MjSpec> {
-        let spec = file.map_or_else(|| MjSpec::from_xml_string(BUILTIN), MjSpec::from_xml);
+        let spec = match file {
+            None => MjSpec::from_xml_string(BUILTIN),
+            Some(file) => MjSpec::from_xml_vfs(file, &self.files.for_mujoco()),
+        };
         let whole = || file.and_then(parse_error);
         let mut spec =
             spec.map_err(|error| refused(whole().unwrap_or_else(|| error.to_string())))?;

@@ -2,8 +2,47 @@
 
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use mujoco_rs::wrappers::mj_auxiliary::MjVfs;
 
 use crate::os::read_bytes;
+
+/// A user's scene in memory, so that it is the same whenever it is compiled: the names and contents of [`scene_files`], the scene
+/// itself first. Nothing is held of the built-in scene.
+#[derive(Default)]
+pub struct SceneFiles(pub Vec<(String, Vec<u8>)>);
+
+impl SceneFiles {
+    /// These files if they are those of `scene`, and otherwise its files as they are now.
+    pub fn or_read(self: &Arc<Self>, scene: Option<&Path>) -> Arc<Self> {
+        let Some(scene) = scene else {
+            return Arc::default();
+        };
+        if self.hold(scene) {
+            return self.clone();
+        }
+        let read = |path: PathBuf| Some((path.to_str()?.to_owned(), read_bytes(&path).ok()?));
+        let files = scene_files(scene).into_iter().filter_map(read);
+        Arc::new(Self(files.collect()))
+    }
+
+    /// Whether they are the files of this scene.
+    pub fn hold(&self, scene: &Path) -> bool {
+        let first = self.0.first();
+        first.is_some_and(|(name, _)| Path::new(name) == scene)
+    }
+
+    /// The files for MuJoCo, which reads from the disk what is not among them.
+    pub fn for_mujoco(&self) -> MjVfs {
+        let mut files = MjVfs::new();
+        for (name, content) in &self.0 {
+            // MuJoCo takes two spellings of a path for the same file.
+            let _ = files.add_from_buffer(name, content);
+        }
+        files
+    }
+}
 
 /// The files that a scene may read: its own, included files, meshes, textures, height fields. Each is looked for in every
 /// folder that the scene names, so some may not belong to it.

@@ -4,7 +4,7 @@
 
 use std::path::Path;
 
-use anyhow::{Context, Result, anyhow};
+use anyhow::{Context, Result};
 use mujoco_rs::prelude::MjModel;
 use mujoco_rs::wrappers::SpecItem;
 use mujoco_rs::wrappers::mj_editing::MjsBody;
@@ -73,7 +73,7 @@ pub fn furnished(
             .context("a body of the compiled scene")?;
         colour_faces(body, half, opacity);
     }
-    spec.compile().map(Some).map_err(|error| anyhow!("{error}"))
+    compilation.finish(spec).map(Some)
 }
 
 /// Puts a coloured plate on each face of a box with these half sizes in m.

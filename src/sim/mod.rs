@@ -11,13 +11,13 @@ mod files;
 mod fingerprint;
 mod finite;
 mod furnish;
-#[cfg(any(feature = "video", feature = "viewer"))]
+#[cfg(any(feature = "pictures", feature = "viewer"))]
 mod graphics;
 mod look;
 #[cfg(feature = "viewer")]
 mod panel;
 mod placing;
-#[cfg(feature = "video")]
+#[cfg(feature = "pictures")]
 mod renderer;
 mod scene;
 mod simulation;
@@ -30,7 +30,7 @@ mod viewer;
 pub use compilation::{Compilation, Cone, origin};
 pub use drawing::Drawing;
 pub use fatal::{before_fatal_error, stepping};
-pub use files::scene_files;
+pub use files::{SceneFiles, scene_files};
 pub use look::{Camera, Dress, Look, Piece, Quality};
 pub use mujoco_rs::mujoco_version;
 pub use scene::{Actuator, Body, Frame, FreeJoint, Hinge, Mocap, Scene};
@@ -40,7 +40,7 @@ pub use variation::Change;
 
 #[cfg(feature = "viewer")]
 pub use panel::{Controls, Gauge, Readout, SPEEDS, Trend};
-#[cfg(feature = "video")]
+#[cfg(feature = "pictures")]
 pub use renderer::Renderer;
 #[cfg(feature = "viewer")]
 pub use viewer::Viewer;

@@ -65,11 +65,7 @@ fn lead(args: &TrainArgs, requests: &Requests, exchange: &Exchange) -> Result<Ex
     }
     requests.wait_for_end();
     say!("run folder: {place}");
-    session
-        .task
-        .warnings
-        .iter()
-        .for_each(|warning| say!("warning: {warning}"));
+    session.task.say_warnings();
     if !args.quiet {
         let default = Config::default();
         let hints = hints(&session.config, args, &default, session.task.scene.size());

@@ -402,7 +402,12 @@ fn an_environment_starts_its_next_episode_in_the_same_step_in_the_next_or_when_i
 fn the_episodes_of_a_seed_start_again_when_it_is_set_again() {
     let mut pool = AtOnce::new(4, &[], false);
     let mut restart = |seed: Option<u64>| {
-        seed.into_iter().for_each(|seed| pool.pool.reseed(seed));
+        if let Some(seed) = seed {
+            for member in pool.pool.members_mut() {
+                member.seed = seed;
+                member.next_episode = member.number as u64;
+            }
+        }
         pool.pool.restart(&[true; 4], false, &mut pool.observations);
         pool.row(2).to_vec()
     };
