@@ -29,7 +29,12 @@ def test_the_code_of_the_document_runs(number, tmp_path, monkeypatch):
         test = doctest.DocTestParser().get_doctest(code, NAMES, f"block {number}", "docs/PYTHON.md", 0)
         assert doctest.DocTestRunner().run(test).failed == 0
     else:
-        exec(compile(code, f"docs/PYTHON.md, block {number}", "exec"), NAMES)
+        try:
+            exec(compile(code, f"docs/PYTHON.md, block {number}", "exec"), NAMES)
+        except RuntimeError as error:
+            if "EGL" not in str(error):
+                raise
+            pytest.skip("pictures cannot be drawn here")
 
 
 def test_there_is_code_in_the_document():

@@ -173,6 +173,7 @@ def test_a_warning_about_a_policy_is_said_at_every_door(other_ranges, tmp_path):
             door()
         assert len(warnings) == 1 and warnings[0].filename == __file__
     sets = [f"--set={key}={value}" for key, value in other_ranges.items()]
-    for command in (["export", "--ckpt", "builtin", "--out", "x.onnx"], ["play", "--ckpt", "builtin", "--json", "--episodes", "1"]):
-        found = subprocess.run([program(), *command, *sets], cwd=tmp_path, capture_output=True, text=True, check=True)
+    for command in (["export", "--out", "x.onnx"], ["play", "--json", "--episodes", "1"], ["play", "--plain", "--out", "x.html"]):
+        found = subprocess.run([program(), *command, "--ckpt", "builtin", *sets], cwd=tmp_path, capture_output=True, text=True, check=True)
         assert "warning: an action means another angle than in training" in found.stderr
+    assert "; warning: an action means another angle than in training" in (tmp_path / "x.html").read_text()

@@ -63,7 +63,7 @@ pub fn scene_files(scene: &Path) -> Vec<PathBuf> {
         for (name, value) in attributes(&text) {
             folders.insert(folder.clone());
             if name.ends_with("dir") {
-                folders.insert(top.join(value));
+                folders.extend([top.join(value), folder.join(value)]);
             } else if name.starts_with("file") {
                 names.insert(PathBuf::from(value));
                 // With `strippath`, only the last part counts.
