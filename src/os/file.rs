@@ -3,18 +3,19 @@
 use std::fs::{self, File, Metadata};
 use std::io::{self, Read};
 use std::os::unix::fs::MetadataExt;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::time::SystemTime;
 
 use anyhow::{Context, Result, ensure};
-
-use super::folder::shown;
 
 /// The most bytes of a text file. A configuration takes a few KiB.
 const LARGEST_TEXT: u64 = 1 << 20;
 
 /// The most bytes of a binary file. The largest policy that the settings allow, its optimizer and 65536 environments take less.
 const LARGEST_BYTES: u64 = 1 << 30;
+
+/// Where the system lists the handles of this process. A path through one of them leads to what is open, whatever its name is.
+pub const HANDLES: &str = "/proc/self/fd";
 
 /// An operation on a file or folder, whose error says what could not be done.
 pub trait Cannot<T> {
@@ -29,6 +30,23 @@ impl<T> Cannot<T> for io::Result<T> {
     fn cannot(self, do_what: &str, path: &Path) -> Result<T> {
         self.with_context(|| format!("cannot {do_what} {}", shown(path).display()))
     }
+}
+
+/// A path for a message: one that leads through a handle is given as it would be without, from the working folder if it lies there.
+pub fn shown(path: &Path) -> PathBuf {
+    let through = || {
+        let mut parts = path.strip_prefix(HANDLES).ok()?.components();
+        let folder = fs::read_link(Path::new(HANDLES).join(parts.next()?)).ok()?;
+        let whole = folder.join(parts.as_path());
+        let here = std::env::current_dir().unwrap_or_default();
+        Some(
+            whole
+                .strip_prefix(here)
+                .map(Path::to_owned)
+                .unwrap_or(whole),
+        )
+    };
+    through().unwrap_or_else(|| path.to_owned())
 }
 
 /// Reads the text of a file.

@@ -8,10 +8,7 @@ use std::sync::Arc;
 
 use anyhow::Result;
 
-use super::file::{Cannot, expect_named};
-
-/// Where the system lists the handles of this process. A path through one of them leads to what is open, whatever its name is.
-const HANDLES: &str = "/proc/self/fd";
+use super::file::{Cannot, HANDLES, expect_named};
 
 /// A folder that is known by its name or, once it is held, by a handle. Then its files are reached even after it was renamed, and
 /// what has taken its name is not.
@@ -72,25 +69,9 @@ impl Folder {
     }
 }
 
-/// A path for a message: one that leads through a handle is given as it would be without, from the working folder if it lies there.
-pub fn shown(path: &Path) -> PathBuf {
-    let through = || {
-        let mut parts = path.strip_prefix(HANDLES).ok()?.components();
-        let folder = fs::read_link(Path::new(HANDLES).join(parts.next()?)).ok()?;
-        let whole = folder.join(parts.as_path());
-        let here = std::env::current_dir().unwrap_or_default();
-        Some(
-            whole
-                .strip_prefix(here)
-                .map(Path::to_owned)
-                .unwrap_or(whole),
-        )
-    };
-    through().unwrap_or_else(|| path.to_owned())
-}
-
 #[cfg(test)]
 mod tests {
+    use super::super::file::shown;
     use super::*;
 
     fn held(name: PathBuf) -> Folder {

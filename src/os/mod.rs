@@ -20,8 +20,8 @@ mod threads;
 
 pub use console::colors_enabled;
 pub use destination::Destination;
-pub use file::{Cannot, Stamp, expect_named, read_bytes, read_text, same_file, stamp};
-pub use folder::{Folder, shown};
+pub use file::{Cannot, Stamp, expect_named, read_bytes, read_text, same_file, shown, stamp};
+pub use folder::Folder;
 pub use interrupt::{Requests, exit_code};
 pub use lock::{Hold, LOCK, Locked};
 pub use machine::{Machine, processor_seconds, program_checksum};

@@ -401,7 +401,7 @@ fn a_run_folder_that_cannot_be_written_to_is_an_error_before_anything_is_trained
         folder.path(),
         &train(&["--run-dir", "file/run"]),
         1,
-        &["cannot create the run folder"],
+        &["cannot create the folder file/run"],
     );
     // Permissions do not stop root, who may be running the tests.
     let locked = folder.path().join("locked");
