@@ -352,6 +352,8 @@ def check(policy, scene, model, trace):
         sys.exit(f"error: {trace} is not a complete trace: {error}")
     if "sim_dt" not in header:
         sys.exit(f"error: {trace} does not begin with the header of a trace, so its task is not known")
+    if not any(one["episode"] == other["episode"] for one, other in zip(records, records[1:])):
+        sys.exit(f"error: {trace} has no two records of one episode, so there is nothing to compare")
     if header.get("noise") or header.get("bias"):
         sys.exit(f"error: {trace} was written with noise or bias, so its observations cannot be computed from its states")
     for key in sorted(header.keys() & model.env.keys() - {"model", *OF_WORLD}):

@@ -145,7 +145,7 @@ pub fn parse_from<T: Into<OsString> + Clone>(
 /// The options that change settings.
 #[derive(Args, Default)]
 pub struct SettingArgs {
-    /// TOML file with the settings that differ from the defaults
+    /// TOML file with the settings that differ from the defaults; a relative env.model in it counts from the folder of the file
     #[arg(long, value_name = "FILE", help_heading = SETTINGS)]
     pub config: Option<PathBuf>,
     /// Change one setting that the command uses, e.g. env.sim_dt=0.005; repeatable, overrides the file

@@ -70,10 +70,15 @@ impl Reader {
             return table;
         }
         let stored = model(&table).to_owned();
-        let asked = sets.iter().rfind(|set| set.key == MODEL);
+        let asked = |Override { key, value }: &Override| {
+            lookup(&table_of(key, value, &DEFAULTS), MODEL).cloned()
+        };
+        let asked = sets.iter().rev().find_map(asked);
         let is_kept = |place: &Value| match &*stored {
             BUILTIN_MODEL => *place != DEFAULTS["env"]["goal_position"],
-            stored => asked.is_none_or(|asked| names_scene(&asked.value, stored)),
+            stored => asked
+                .as_ref()
+                .is_none_or(|asked| names_scene(asked, stored)),
         };
         table.retain(|section, _| ["env", "hand", "ppo"].contains(&section));
         for (section, keys) in &mut table {
@@ -201,7 +206,14 @@ impl Settings {
             layers.named.remove(MODEL);
         }
         if let Some(file) = &self.file {
-            layers.lay(&file.table()?);
+            let table = file.table()?;
+            layers.lay(&table);
+            let scene = model(&table);
+            // What comes through a pipe has no folder.
+            if scene != BUILTIN_MODEL && file.path.is_file() {
+                let place = file.path.with_file_name(scene);
+                layers.merged["env"]["model"] = place.display().to_string().into();
+            }
         }
         for Override { key, value } in &self.sets {
             layers.lay(&table_of(key, value, &layers.merged));
@@ -399,6 +411,52 @@ mod tests {
             fork(&["env.model=x.xml", "run.shards=2"]),
             Ok(("x.xml".into(), 2))
         );
+    }
+
+    #[test]
+    fn a_relative_scene_counts_from_the_folder_of_the_file_that_names_it() {
+        let place = tempfile::tempdir().unwrap();
+        let path = place.path().join("x.toml");
+        let model = |text: &str, sets: &[&str]| {
+            os::write_whole(&path, text.as_bytes()).unwrap();
+            let sets: Vec<Override> = sets.iter().map(|text| set(text)).collect();
+            let settings = Settings::new().user_file(Some(&path)).unwrap().sets(&sets);
+            settings.resolve().unwrap().env.model
+        };
+        let named = |model: &str| format!("[env]\nmodel = \"{model}\"\n");
+        let here = place.path().join("own/s.xml").display().to_string();
+        assert_eq!(model(&named("own/s.xml"), &[]), here);
+        assert_eq!(model(&named(&here), &[]), here);
+        assert_eq!(model(&named("/a/s.xml"), &[]), "/a/s.xml");
+        assert_eq!(model(&named("builtin"), &[]), "builtin");
+        assert_eq!(model(&named("own/s.xml"), &["env.model=s.xml"]), "s.xml");
+        assert_eq!(model("", &["env={model=\"s.xml\"}"]), "s.xml");
+    }
+
+    #[test]
+    fn a_scene_that_a_table_of_a_section_names_is_another_scene() {
+        let place = tempfile::tempdir().unwrap();
+        let [own, other] =
+            ["own.xml", "other.xml"].map(|name| place.path().canonicalize().unwrap().join(name));
+        for path in [&own, &other] {
+            os::write_whole(path, b"").unwrap();
+        }
+        let text = format!(
+            "[env]\nmodel = \"{}\"\ngoal_position = [1, 2, 3]",
+            own.display()
+        );
+        for (scene, is_kept) in [(&own, true), (&other, false)] {
+            for form in ["env.model=PATH", "env={model=\"PATH\"}"] {
+                let sets = [set(&form.replace("PATH", &scene.display().to_string()))];
+                let player = Reader::Player { env_steps: 0 };
+                let config = Settings::new()
+                    .stored(file(&text), player)
+                    .sets(&sets)
+                    .resolve()
+                    .unwrap();
+                assert_eq!(config.env.goal_position.named, is_kept, "{form}");
+            }
+        }
     }
 
     #[test]

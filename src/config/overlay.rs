@@ -104,12 +104,9 @@ fn with_zeros(text: &str) -> String {
         .collect()
 }
 
-/// Whether `text`, a value of `env.model`, names the scene at the absolute path `stored`.
-pub fn names_scene(text: &str, stored: &str) -> bool {
-    let asked = table_of("env.model", text, &DEFAULTS);
-    let file = lookup(&asked, "env.model")
-        .and_then(Value::as_str)
-        .map(|asked| Path::new(asked).canonicalize());
+/// Whether a value of `env.model` names the scene at the absolute path `stored`.
+pub fn names_scene(asked: &Value, stored: &str) -> bool {
+    let file = asked.as_str().map(|asked| Path::new(asked).canonicalize());
     file.is_some_and(|file| file.is_ok_and(|file| file == Path::new(stored)))
 }
 

@@ -17,6 +17,9 @@ use crate::run::{self, RunFolder};
 use crate::see::{self, About, Live, Replay};
 use crate::sim::Look;
 
+/// The most bytes of a line of a trace. A step of the Shadow Hand has 5000.
+const LONGEST_LINE: usize = 1 << 22;
+
 /// The text for the origin of a built-in policy.
 const BUILT_IN: &str = "built into the program";
 
@@ -157,6 +160,11 @@ pub fn from_trace(
         cannot()
     );
     let text = String::from_utf8(bytes).with_context(cannot)?;
+    ensure!(
+        text.lines().all(|line| line.len() <= LONGEST_LINE),
+        "{}: it has a line of more than {LONGEST_LINE} bytes",
+        cannot()
+    );
     let header = header(&text).with_context(cannot)?;
     if let Some(set) = set
         .iter()

@@ -99,6 +99,11 @@ impl Repose {
         std::mem::take(&mut self.sums)
     }
 
+    /// A number up to `most` in magnitude.
+    fn noise(&mut self, most: f64) -> f64 {
+        rng::uniform(&mut self.rng, -most, most)
+    }
+
     fn draw_rotation(&mut self) -> Quat {
         let mut draw = || rng::uniform(&mut self.rng, 0.0, 1.0);
         quat::uniform([draw(), draw(), draw()])
@@ -230,28 +235,22 @@ impl Env for Repose {
         self.sim.reset();
         self.sim.qpos_mut().copy_from_slice(&hand.start);
         for joint in &hand.joints {
-            let noise = rng::uniform(
-                &mut self.rng,
-                -config.reset_dof_pos_noise,
-                config.reset_dof_pos_noise,
-            );
+            let noise = self.noise(config.reset_dof_pos_noise);
+            if joint.is_in_loop {
+                continue;
+            }
             let angle = &mut self.sim.qpos_mut()[joint.qpos];
             *angle = (*angle + noise).clamp(joint.range[0], joint.range[1]);
         }
         for joint in &hand.joints {
-            let noise = rng::uniform(
-                &mut self.rng,
-                -config.reset_dof_vel_noise,
-                config.reset_dof_vel_noise,
-            );
-            self.sim.qvel_mut()[joint.dof] = noise;
+            let noise = self.noise(config.reset_dof_vel_noise);
+            if !joint.is_in_loop {
+                self.sim.qvel_mut()[joint.dof] = noise;
+            }
         }
+        self.sim.follow();
         for (axis, start) in config.goal_position.value.into_iter().enumerate() {
-            let noise = rng::uniform(
-                &mut self.rng,
-                -config.reset_position_noise,
-                config.reset_position_noise,
-            );
+            let noise = self.noise(config.reset_position_noise);
             self.sim.qpos_mut()[hand.object.qpos + axis] = start + noise;
         }
         let orientation = self.draw_rotation();

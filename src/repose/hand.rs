@@ -112,12 +112,10 @@ impl Hand {
             "has {controls} controls, but it must have exactly the {} of the hand",
             actuators.len()
         );
-        let mut roots: Vec<Body> = fingertips.iter().map(|&tip| scene.root(tip)).collect();
-        roots.sort();
-        roots.dedup();
+        let roots = roots(scene, &parts, &fingertips)?;
         let start = scene.pose_of(keyframe);
         let layout = Layout::new(joints.len(), fingertips.len(), actuators.len());
-        let hand = Self {
+        Ok(Self {
             parts,
             joints,
             actuators,
@@ -129,9 +127,7 @@ impl Hand {
             keyframe,
             start,
             layout,
-        };
-        hand.expect_shadow_drives()?;
-        Ok(hand)
+        })
     }
 
     /// Where an episode starts the object, before noise, m.
@@ -150,34 +146,6 @@ impl Hand {
             .iter()
             .map(|name| name.strip_prefix(prefix));
         names.eq(JOINTS.map(Some)).then_some(prefix)
-    }
-
-    /// Checks that a hand with the names of the Shadow Hand has its drives.
-    fn expect_shadow_drives(&self) -> Result<()> {
-        let Some(prefix) = self.side() else {
-            return Ok(());
-        };
-        for (name, driven) in self.parts.actuators.iter().zip(&self.driven) {
-            let Some(actuator) = name
-                .strip_prefix(prefix)
-                .and_then(|name| name.strip_prefix("A_"))
-            else {
-                continue;
-            };
-            let expected = match actuator.strip_suffix("J0") {
-                Some(finger) => vec![format!("{prefix}{finger}J1"), format!("{prefix}{finger}J2")],
-                None => vec![format!("{prefix}{actuator}")],
-            };
-            let all = expected
-                .iter()
-                .all(|joint| driven.contains(&(joint.clone(), 1.0)));
-            ensure!(
-                all && driven.len() == expected.len(),
-                "actuator `{name}` must drive {}",
-                expected.join(" + ")
-            );
-        }
-        Ok(())
     }
 }
 
@@ -202,6 +170,22 @@ fn shadow_hand(scene: &Scene) -> Option<Parts> {
             && hand.actuators.iter().all(|name| actuators.contains(name))
             && hand.fingertips.iter().all(|name| scene.body(name).is_ok())
     })
+}
+
+/// The first bodies of the trees that carry these fingertips.
+///
+/// # Errors
+/// Fails if a fingertip is no part of a hand.
+fn roots(scene: &Scene, parts: &Parts, fingertips: &[Frame]) -> Result<Vec<Body>> {
+    let mut roots: Vec<Body> = fingertips.iter().map(|&tip| scene.root(tip)).collect();
+    roots.sort();
+    roots.dedup();
+    let others = ["world", &parts.object, &parts.goal].map(|name| scene.body(name).ok());
+    ensure!(
+        roots.iter().all(|&root| !others.contains(&Some(root))),
+        "hand.fingertips must name parts of the hand, and not the world, the object or the goal"
+    );
+    Ok(roots)
 }
 
 /// Finds each of these names, and lists what is wrong.

@@ -1,5 +1,7 @@
 //! What a policy's file says about the hand and the object that it was trained with.
 
+use std::collections::BTreeSet;
+
 use anyhow::{Result, anyhow, ensure};
 use serde::{Deserialize, Serialize};
 
@@ -160,11 +162,13 @@ impl Record {
 
     /// A warning if an action means another angle with the hand `there`.
     pub(super) fn warning(&self, there: &Self) -> Option<String> {
-        let sum = |of: &Self, i: usize| {
-            of.driven[i]
-                .iter()
-                .map(|(_, coefficient)| *coefficient)
-                .collect::<Vec<_>>()
+        // In whatever order a tendon has its joints.
+        let sum = |of: &Self, i: usize| -> BTreeSet<_> {
+            let place = |name: &String| of.joints.iter().position(|joint| joint == name);
+            let driven = of.driven[i].iter();
+            driven
+                .map(|(name, coefficient)| (place(name), coefficient.to_bits()))
+                .collect()
         };
         let apart = |i: &usize| {
             let mut ends = self.ranges[*i].iter().zip(there.ranges[*i]);

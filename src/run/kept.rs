@@ -24,16 +24,17 @@ const INSIDE: [&str; 7] = [
 /// for its own files. Other names in the folder of a run are free.
 ///
 /// # Errors
-/// Fails if it does, even through links.
+/// Fails if it does, even through links, or as [`scene_files`] does.
 pub fn expect_output<'a>(
     path: &Path,
     read: impl IntoIterator<Item = &'a Path>,
     scene: Option<&Path>,
 ) -> Result<()> {
+    let of_scene = scene.map(scene_files).transpose()?;
     let mut read = read
         .into_iter()
         .map(PathBuf::from)
-        .chain(scene.map(scene_files).unwrap_or_default());
+        .chain(of_scene.unwrap_or_default());
     if let Some(read) = read.find(|read| same_file(path, read)) {
         bail!(
             "{}: would replace the input {}; choose another name",

@@ -18,8 +18,8 @@ use mujoco_rs::wrappers::SpecItem;
 use mujoco_rs::wrappers::mj_editing::{MjsBody, MjsGeom};
 use serde::{Deserialize, Serialize};
 
-use super::SceneFiles;
 use super::constants::*;
+use super::files::{SceneFiles, scene_files};
 use super::placing::{frames_within, geoms_within};
 use crate::quat;
 
@@ -83,26 +83,38 @@ impl Compilation {
     /// Compiles the built-in scene (`None`) or a user's file.
     ///
     /// # Errors
-    /// Fails with MuJoCo's own message if MuJoCo refuses the scene, or if the object cannot be resized.
+    /// Fails with MuJoCo's own message if MuJoCo refuses the scene, or if the object cannot be resized. Fails if a name is not UTF-8,
+    /// or if the scene names a pipe or a device.
     pub(super) fn compile(&self, file: Option<&Path>) -> Result<MjModel> {
         ensure!(
             !file.is_some_and(Path::is_dir),
             "env.model must name a MuJoCo scene, but this is a folder"
         );
-        ensure!(
-            file.is_none_or(|file| self.files.hold(file) || file.is_file()),
-            "env.model must name a MuJoCo scene, but there is no such file"
-        );
+        if let Some(file) = file.filter(|file| !self.files.hold(file)) {
+            ensure!(
+                file.is_file(),
+                "env.model must name a MuJoCo scene, but there is no such file"
+            );
+            scene_files(file)?;
+        }
         self.finish(self.spec(file)?)
     }
 
     /// Compiles a scene that was read.
     ///
     /// # Errors
-    /// Fails with MuJoCo's own message if MuJoCo refuses the scene.
+    /// Fails with MuJoCo's own message if MuJoCo refuses the scene, or if a name is not UTF-8.
     pub(super) fn finish(&self, mut spec: MjSpec) -> Result<MjModel> {
-        spec.compile_with_vfs(&self.files.for_mujoco())
-            .map_err(refused)
+        let model = spec
+            .compile_with_vfs(&self.files.for_mujoco())
+            .map_err(refused)?;
+        // The wrapper returns names as text, whatever their bytes are.
+        let names = model.names().iter().map(|&byte| byte as u8).collect();
+        ensure!(
+            String::from_utf8(names).is_ok(),
+            "a name in it is not UTF-8; save the scene as UTF-8"
+        );
+        Ok(model)
     }
 
     /// Reads a scene that is about to be compiled, and resizes its object.

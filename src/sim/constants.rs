@@ -2,6 +2,6 @@
 
 pub(super) use mujoco_rs::mujoco_c::{
     _mjtGeomBase::*, _mjtObjBase::*, mjtBias::*, mjtBuiltin::*, mjtCone::*, mjtDisableBit::*,
-    mjtDyn::*, mjtEnableBit::*, mjtGain::*, mjtGeomInertia::*, mjtIntegrator::*, mjtJoint::*,
-    mjtLightType::*, mjtState::*, mjtTexture::*, mjtTrn::*, mjtWarning::*, mjtWrap::*,
+    mjtDyn::*, mjtEnableBit::*, mjtEq::*, mjtGain::*, mjtGeomInertia::*, mjtIntegrator::*,
+    mjtJoint::*, mjtLightType::*, mjtState::*, mjtTexture::*, mjtTrn::*, mjtWarning::*, mjtWrap::*,
 };

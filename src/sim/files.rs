@@ -4,6 +4,7 @@ use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
+use anyhow::{Result, ensure};
 use mujoco_rs::wrappers::mj_auxiliary::MjVfs;
 
 use crate::os::read_bytes;
@@ -15,16 +16,19 @@ pub struct SceneFiles(pub Vec<(String, Vec<u8>)>);
 
 impl SceneFiles {
     /// These files if they are those of `scene`, and otherwise its files as they are now.
-    pub fn or_read(self: &Arc<Self>, scene: Option<&Path>) -> Arc<Self> {
+    ///
+    /// # Errors
+    /// Fails as [`scene_files`] does.
+    pub fn or_read(self: &Arc<Self>, scene: Option<&Path>) -> Result<Arc<Self>> {
         let Some(scene) = scene else {
-            return Arc::default();
+            return Ok(Arc::default());
         };
         if self.hold(scene) {
-            return self.clone();
+            return Ok(self.clone());
         }
         let read = |path: PathBuf| Some((path.to_str()?.to_owned(), read_bytes(&path).ok()?));
-        let files = scene_files(scene).into_iter().filter_map(read);
-        Arc::new(Self(files.collect()))
+        let files = scene_files(scene)?.into_iter().filter_map(read);
+        Ok(Arc::new(Self(files.collect())))
     }
 
     /// Whether they are the files of this scene.
@@ -44,53 +48,76 @@ impl SceneFiles {
     }
 }
 
-/// The files that a scene may read: its own, included files, meshes, textures, height fields. Each is looked for in every
-/// folder that the scene names, so some may not belong to it.
-pub fn scene_files(scene: &Path) -> Vec<PathBuf> {
+/// The most folders of meshes and pictures in which a file is looked for. MuJoCo uses the last ones that a scene names.
+const MOST_FOLDERS: usize = 32;
+
+/// The files and folders that a scene may read: its own file, included ones, models, meshes, textures, height fields. Each is
+/// looked for wherever MuJoCo may look for it, so some may not belong to the scene. The bytes of meshes and textures are not read.
+///
+/// # Errors
+/// Fails if one of them is a pipe or a device: MuJoCo could wait for its end for ever.
+pub fn scene_files(scene: &Path) -> Result<Vec<PathBuf>> {
     let folder_of = |path: &Path| path.parent().unwrap_or(Path::new("")).to_owned();
-    let top = folder_of(scene);
     let mut files = vec![scene.to_owned()];
-    let mut folders = BTreeSet::new();
-    let mut names = BTreeSet::new();
-    let mut known = BTreeSet::from([scene.to_owned()]);
-    let mut done = 0;
-    while done < files.len() {
+    let mut scenes = files.clone();
+    let mut known = BTreeSet::new();
+    let mut folders = Vec::new();
+    let mut named = Vec::new();
+    while let Some(own) = scenes.pop() {
+        let near = [folder_of(&own), folder_of(scene)];
         // What is no XML names no files.
-        let bytes = read_bytes(&files[done]).unwrap_or_default();
-        let text = String::from_utf8_lossy(&bytes);
-        let folder = folder_of(&files[done]);
-        done += 1;
-        for (name, value) in attributes(&text) {
-            folders.insert(folder.clone());
-            if name.ends_with("dir") {
-                folders.extend([top.join(value), folder.join(value)]);
+        let bytes = read_bytes(&own).unwrap_or_default();
+        for (element, name, value) in attributes(&String::from_utf8_lossy(&bytes)) {
+            let places = near.clone().map(|folder| folder.join(value));
+            if element == "compiler" && name.ends_with("dir") {
+                folders.extend(places);
             } else if name.starts_with("file") {
-                names.insert(PathBuf::from(value));
-                // With `strippath`, only the last part counts.
-                names.extend(Path::new(value).file_name().map(PathBuf::from));
+                named.push((near.clone(), value.to_owned()));
+                if ["include", "model"].contains(&element) {
+                    let is_new =
+                        |path: &PathBuf| path.canonicalize().is_ok_and(|end| known.insert(end));
+                    scenes.extend(places.into_iter().filter(is_new));
+                }
             }
         }
-        let found = folders
-            .iter()
-            .flat_map(|folder| names.iter().map(|name| folder.join(name)));
-        let found: Vec<PathBuf> = found
-            .filter(|path| !known.contains(path) && path.is_file())
-            .collect();
-        known.extend(found.iter().cloned());
-        files.extend(found);
     }
-    files
+    for (near, name) in &named {
+        // With `strippath`, only the last part of a name counts.
+        let last = name.rsplit('/').next().unwrap_or_default();
+        let folders = near.iter().chain(folders.iter().rev().take(MOST_FOLDERS));
+        for path in folders.flat_map(|folder| [name, last].map(|name| folder.join(name))) {
+            let Ok(facts) = path.metadata() else { continue };
+            ensure!(
+                facts.is_file() || facts.is_dir(),
+                "{} is a pipe or a device, not a file",
+                path.display()
+            );
+            files.push(path);
+        }
+    }
+    Ok(files)
 }
 
-/// The names and values of all attributes.
-fn attributes(text: &str) -> impl Iterator<Item = (&str, &str)> {
-    text.match_indices('=').filter_map(|(at, _)| {
-        let name = text[..at]
-            .trim_end()
-            .rsplit(|c: char| !c.is_alphanumeric())
-            .next()?;
-        let value = text[at + 1..].trim_start();
-        let quote = value.chars().next().filter(|c| "\"'".contains(*c))?;
-        Some((name, value[1..].split(quote).next()?))
+/// The attributes in a text: the names of their elements, their own names, and their values. Comments are left out.
+fn attributes(text: &str) -> impl Iterator<Item = (&str, &str, &str)> {
+    let word = |c: char| !c.is_alphanumeric();
+    let mut is_comment = false;
+    let elements = text.split('<').filter(move |element| {
+        is_comment |= element.starts_with("!--");
+        let is_left_out = is_comment;
+        is_comment &= !element.contains("-->");
+        !is_left_out
+    });
+    elements.flat_map(move |element| {
+        element.match_indices('=').filter_map(move |(at, _)| {
+            let name = element[..at].trim_end().rsplit(word).next()?;
+            let value = element[at + 1..].trim_start();
+            let quote = value.chars().next().filter(|c| "\"'".contains(*c))?;
+            Some((
+                element.split(word).next()?,
+                name,
+                value[1..].split(quote).next()?,
+            ))
+        })
     })
 }

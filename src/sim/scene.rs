@@ -38,6 +38,8 @@ pub struct Hinge {
     pub dof: usize,
     /// Limits, rad.
     pub range: [f64; 2],
+    /// Whether a connect or weld constraint makes it part of a loop.
+    pub is_in_loop: bool,
 }
 
 /// A free joint: position and orientation w,x,y,z from `qpos`, linear (world) and angular (body frame) velocity from `dof`.
@@ -195,6 +197,7 @@ impl Scene {
             qpos: self.model.jnt_qposadr()[id] as usize,
             dof: self.model.jnt_dofadr()[id] as usize,
             range: self.model.jnt_range()[id],
+            is_in_loop: self.is_in_loop(id),
         })
     }
 

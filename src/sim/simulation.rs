@@ -106,6 +106,25 @@ impl Simulation {
         self.data.qvel_mut()
     }
 
+    /// Moves each joint that follows another by an equality constraint to where the constraint wants it.
+    /// [`Simulation::refresh`] must follow.
+    pub fn follow(&mut self) {
+        // A joint may follow one that follows.
+        for _ in 0..self.data.model().neq() {
+            self.refresh();
+            for row in 0..self.data.ne() as usize {
+                let model = self.data.model();
+                let tie = self.data.efc_id()[row] as usize;
+                if model.eq_type()[tie] == mjEQ_JOINT {
+                    let joint = model.eq_obj1id()[tie] as usize;
+                    let qpos = model.jnt_qposadr()[joint] as usize;
+                    let apart = self.data.efc_pos()[row];
+                    self.qpos_mut()[qpos] -= apart;
+                }
+            }
+        }
+    }
+
     /// The controls, in the model's order.
     pub fn ctrl(&self) -> &[f64] {
         self.data.ctrl()

@@ -1,6 +1,7 @@
 //! The parts of a hand and its surroundings, found by the structure of a scene where they are not named.
 
 use std::collections::BTreeSet;
+use std::iter;
 
 use anyhow::{Result, ensure};
 use mujoco_rs::prelude::{MjtObjBase, MjtWrap};
@@ -61,7 +62,11 @@ impl Scene {
             ("bodies with a free joint", "hand.object"),
             &mut problems,
         );
-        let held = self.trees_of_constraints();
+        let held: BTreeSet<usize> = self
+            .held()
+            .flatten()
+            .map(|body| self.root_of(body))
+            .collect();
         let is_goal = |body: &usize| self.model.body_mocapid()[*body] >= 0 && !held.contains(body);
         let goals: Vec<usize> = others.filter(is_goal).collect();
         self.name_only(
@@ -151,20 +156,26 @@ impl Scene {
         self.model.body_rootid()[body] as usize
     }
 
-    /// The first bodies of the trees that equality constraints tie to each other, e.g. a mocap body that guides a hand.
-    fn trees_of_constraints(&self) -> BTreeSet<usize> {
+    /// The bodies that connect and weld constraints hold together, e.g. a mocap body that guides a hand.
+    fn held(&self) -> impl Iterator<Item = [usize; 2]> {
         let model = &self.model;
-        let mut trees = BTreeSet::new();
-        for (i, kind) in model.eq_objtype().iter().enumerate() {
-            for id in [model.eq_obj1id()[i] as usize, model.eq_obj2id()[i] as usize] {
-                match *kind {
-                    mjOBJ_BODY => trees.insert(self.root_of(id)),
-                    mjOBJ_SITE => trees.insert(self.root_of(model.site_bodyid()[id] as usize)),
-                    _ => false,
-                };
+        let ends = move |i: usize| {
+            let ends = [model.eq_obj1id()[i], model.eq_obj2id()[i]].map(|id| id as usize);
+            match model.eq_objtype()[i] {
+                mjOBJ_BODY => Some(ends),
+                mjOBJ_SITE => Some(ends.map(|site| model.site_bodyid()[site] as usize)),
+                _ => None,
             }
-        }
-        trees
+        };
+        (0..model.neq() as usize).filter_map(ends)
+    }
+
+    /// Whether a joint is part of a loop that such a constraint closes: it moves one end without the other.
+    pub(super) fn is_in_loop(&self, joint: usize) -> bool {
+        let parent = |&body: &usize| (body > 0).then(|| self.model.body_parentid()[body] as usize);
+        let moved = self.model.jnt_bodyid()[joint] as usize;
+        let moves = |end: usize| iter::successors(Some(end), parent).any(|body| body == moved);
+        self.held().any(|[one, other]| moves(one) != moves(other))
     }
 
     /// The bodies that one of these hinges moves and that carry no other body.

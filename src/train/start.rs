@@ -382,7 +382,9 @@ fn expect_scene(parent: &Config, config: &Config, checkpoint: &Checkpoint) -> Re
     let mut before = parent.clone();
     before.env.model.clone_from(&config.env.model);
     before.hand.clone_from(&config.hand);
-    let here = Task::new(&before)?.scene.fingerprint();
+    let task =
+        Task::new(&before).context("a fork keeps the scene and the hand of its checkpoint")?;
+    let here = task.scene.fingerprint();
     ensure!(
         checkpoint.scene == here,
         "{MODEL} = {}: not the scene of the checkpoint, which a fork must keep",

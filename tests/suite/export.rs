@@ -307,6 +307,8 @@ for key in ('obs', 'action'):
     open(key, 'w').write('\\n'.join([header, records[0], json.dumps(record), *records[2:]]))
 open('cut', 'w').write('\\n'.join([header, *records])[:-50])
 open('empty', 'w').close()
+open('bare', 'w').write(header)
+open('one', 'w').write(header + '\\n' + records[0])
 open('other', 'w').write('\\n'.join([header.replace('\"vel_obs_scale\":0.2', '\"vel_obs_scale\":0.5'), *records]))
 ";
 
@@ -366,6 +368,8 @@ fn the_check_in_python_fails_on_what_is_not_a_number_and_on_the_trace_of_another
         ),
         (["policy.onnx", "--check", "cut"], "not a complete trace"),
         (["policy.onnx", "--check", "empty"], "not a complete trace"),
+        (["policy.onnx", "--check", "bare"], "nothing to compare"),
+        (["policy.onnx", "--check", "one"], "nothing to compare"),
         (["policy.onnx", "--episodes", "0"], "at least 1"),
         (["trace.jsonl", "--episodes", "1"], "not an ONNX file"),
     ];

@@ -77,6 +77,101 @@ fn servos_and_contacts_that_the_scene_disables_are_named() {
 }
 
 #[test]
+fn a_name_that_is_not_utf_8_is_refused_whatever_it_is_the_name_of() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("own.xml");
+    let model = format!("env.model={}", path.display());
+    let more = "<worldbody><light name=\"~\"/><camera name=\"~\"/><site name=\"~\"/><geom name=\"~\" size=\".1\"/>";
+    let cases = [
+        ("name=\"cube\"", "name=\"cube~\""),
+        ("<worldbody>", more),
+        (
+            "<actuator>",
+            "<custom><text name=\"~\" data=\"x\"/></custom><actuator>",
+        ),
+        (
+            "<actuator>",
+            "<keyframe><key name=\"~\"/></keyframe><actuator>",
+        ),
+        (
+            "<actuator>",
+            "<equality><joint name=\"~\" joint1=\"rh_FFJ1\"/></equality><actuator>",
+        ),
+        ("<mujoco model=\"", "<mujoco model=\"~"),
+    ];
+    for (from, to) in cases {
+        let text = edited(&[(from, to)]);
+        for (byte, is_text) in [
+            (&b"\xe9"[..], false),
+            (b"&#xD800;", false),
+            ("é".as_bytes(), true),
+        ] {
+            let parts: Vec<&[u8]> = text.split('~').map(str::as_bytes).collect();
+            fs::write(&path, parts.join(byte)).unwrap();
+            let said = Task::new(&config(&[&model]))
+                .err()
+                .map(|error| format!("{error:#}"));
+            let said = said.unwrap_or_default();
+            assert_eq!(!said.contains("is not UTF-8"), is_text, "{to}: {said}");
+        }
+    }
+}
+
+#[test]
+fn a_pipe_or_a_device_in_a_scene_is_refused_before_mujoco_waits_for_it() {
+    let folder = tempfile::tempdir().unwrap();
+    let folder = folder.path();
+    fs::create_dir(folder.join("inner")).unwrap();
+    let made = std::process::Command::new("mkfifo")
+        .args(["pipe", "inner/pipe"])
+        .current_dir(folder)
+        .status();
+    assert!(made.unwrap().success());
+    fs::write(
+        folder.join("inner/more.xml"),
+        "<mujoco><include file=\"inner/pipe\"/></mujoco>",
+    )
+    .unwrap();
+    let compiler = "autolimits=\"true\"/>";
+    let within = |attribute: &str| format!("autolimits=\"true\" {attribute}/>");
+    for (from, to) in [
+        (compiler, format!("{compiler}<include file=\"pipe\"/>")),
+        (compiler, format!("{compiler}<include file=\"/dev/zero\"/>")),
+        (
+            compiler,
+            format!("{compiler}<include file=\"inner/more.xml\"/>"),
+        ),
+        ("<asset>", "<asset><mesh name=\"m\" file = 'pipe'/>".into()),
+        ("<asset>", "<asset><model name=\"m\" file=\"pipe\"/>".into()),
+        (
+            compiler,
+            format!(
+                "{}<asset><mesh file=\"pipe\"/></asset>",
+                within("meshdir=\"inner\"")
+            ),
+        ),
+        (
+            compiler,
+            format!(
+                "{}<asset><texture type=\"cube\" fileup=\"x/pipe\"/></asset>",
+                within("texturedir=\"inner\" strippath=\"true\"")
+            ),
+        ),
+    ] {
+        let path = folder.join("own.xml");
+        fs::write(&path, edited(&[(from, &to)])).unwrap();
+        let said = Scene::load(Some(&path), &Compilation::plain(0.01, Cone::Scene));
+        let said = format!("{:#}", said.err().expect("it is refused"));
+        assert!(said.contains("is a pipe or a device"), "{to}: {said}");
+    }
+    // What stands in a comment is not read.
+    let path = folder.join("own.xml");
+    let comment = "<!-- <a/> <include file=\"pipe\"/> --><worldbody>";
+    fs::write(&path, edited(&[("<worldbody>", comment)])).unwrap();
+    Scene::load(Some(&path), &Compilation::plain(0.01, Cone::Scene)).unwrap();
+}
+
+#[test]
 fn the_fingerprint_sees_servos_pairs_and_limits_and_that_of_the_builtin_scene_stays() {
     let folder = tempfile::tempdir().unwrap();
     let plain = Compilation::plain(0.01, Cone::Scene);

@@ -273,6 +273,37 @@ fn a_hand_with_a_comma_in_a_name_is_trained_but_not_exported() {
 
 #[test]
 fn an_action_that_means_another_angle_than_in_training_is_warned_of() {
+    let joints = "<joint joint=\"rh_FFJ2\" coef=\"1\"/><joint joint=\"rh_FFJ1\" coef=\"1\"/>";
+    let in_other_order =
+        "<joint joint=\"rh_FFJ1\" coef=\"1\"/><joint joint=\"rh_FFJ2\" coef=\"1\"/>";
+    for (from, to, differ) in [
+        (
+            "ctrlrange=\"0 3.1415\"",
+            "ctrlrange=\"0 3\"",
+            "rh_A_FFJ0 rh_A_MFJ0 rh_A_RFJ0 rh_A_LFJ0",
+        ),
+        ("joint=\"rh_FFJ3\"/>", "joint=\"rh_FFJ4\"/>", "rh_A_FFJ3"),
+        (
+            "joint=\"rh_MFJ1\" coef=\"1\"",
+            "joint=\"rh_MFJ1\" coef=\"2\"",
+            "rh_A_MFJ0",
+        ),
+        (joints, in_other_order, ""),
+    ] {
+        assert!(SCENE.contains(from), "{from}");
+        let (_folder, model) = placed(&SCENE.replace(from, to));
+        let there = Task::new(&config(&[&model])).unwrap();
+        let warnings = there
+            .for_policy(&task(&[]).record())
+            .unwrap()
+            .warnings
+            .join("");
+        assert_eq!(warnings.is_empty(), differ.is_empty(), "{to}: {warnings}");
+        assert!(
+            differ.is_empty() || warnings.contains(&format!("the tendons of {differ} differ")),
+            "{to}: {warnings}"
+        );
+    }
     let (folder, model) = placed(&SCENE.replace("ctrlrange=\"0 3.1415\"", "ctrlrange=\"0 3\""));
     let play = [
         "play",
@@ -288,10 +319,101 @@ fn an_action_that_means_another_angle_than_in_training_is_warned_of() {
         folder.path(),
         &[&play[..], &["--set", &model]].concat(),
     )));
+    assert!(said.contains("means another angle"), "{said}");
+}
+
+/// The built-in scene, in which the last joints of the fingers follow the joints before them.
+fn with_followers() -> String {
+    let mut scene = SCENE.to_owned();
+    let mut ties = String::new();
+    for finger in ["FF", "MF", "RF", "LF"] {
+        let servo = format!("class=\"tendon\" tendon=\"rh_{finger}J0\"");
+        assert!(scene.contains(&servo));
+        scene = scene.replace(&servo, &format!("class=\"hand\" joint=\"rh_{finger}J2\""));
+        ties += &format!("<joint joint1=\"rh_{finger}J1\" joint2=\"rh_{finger}J2\"/>");
+    }
+    scene.replace(
+        "<actuator>",
+        &format!("<equality>{ties}</equality><actuator>"),
+    )
+}
+
+#[test]
+fn a_shadow_hand_whose_last_joints_follow_others_is_taken_by_any_prefix() {
+    for prefix in ["rh_", "ih_", ""] {
+        let (_folder, model) = placed(&with_followers().replace("rh_", prefix));
+        let task = Task::new(&config(&[&model])).unwrap();
+        assert_eq!(task.hand.side(), Some(prefix));
+        assert_eq!(task.hand.driven[7], [(format!("{prefix}FFJ2"), 1.0)]);
+    }
+}
+
+#[test]
+fn joints_that_follow_others_start_where_constraints_want_them_and_joints_in_loops_have_no_noise() {
+    let ties = "<joint joint1=\"γ bend\" joint2=\"β tip\" polycoef=\".1 .5 .2 0 0\"/>\
+                <joint joint1=\"β tip\" joint2=\"β bend\"/>\
+                <joint joint1=\"β turn\" polycoef=\".2 1 0 0 0\"/>\
+                <joint joint1=\"γ tip\" joint2=\"γ turn\" active=\"false\"/>\
+                <connect body1=\"α distal\" body2=\"palm\" anchor=\".03 0 0\"/>";
+    let (_folder, model) =
+        placed(&THREE_FINGERS.replace("<tendon>", &format!("<equality>{ties}</equality><tendon>")));
+    let task = task(&[&model]);
+    let mut env = Repose::new(&task);
+    let mut observation = vec![0.0; task.spaces().observation_size];
+    let mut starts = Vec::new();
+    for episode in 0..3 {
+        env.reset(rng::stream(7, "test", episode), &mut observation);
+        starts.push(env.sim.qpos()[..9].to_vec());
+    }
+    for start in &starts {
+        let [.., turn, bend, tip, _, follower, _] = start[..] else {
+            panic!("nine joints")
+        };
+        assert_eq!(start[..3], [0.0, 0.6, 0.4], "the keyframe");
+        assert!((turn - 0.2).abs() < 1e-12 && (tip - bend).abs() < 1e-12);
+        assert!((follower - (0.1 + 0.5 * tip + 0.2 * tip * tip)).abs() < 1e-12);
+    }
+    for noisy in [4, 6, 8] {
+        assert_ne!(starts[0][noisy], starts[1][noisy]);
+    }
+    let notes = task.notes().join("\n");
     assert!(
-        said.contains("ranges or the tendons of rh_A_FFJ0 rh_A_MFJ0 rh_A_RFJ0 rh_A_LFJ0 differ"),
-        "{said}"
+        notes.contains("3 joints are in loops, which equality constraints close"),
+        "{notes}"
     );
+    // A mocap body that guides the whole hand closes no loop.
+    let (_folder, model) = placed(&SCENE.replace(
+        "</worldbody>",
+        "<body name=\"guide\" mocap=\"true\"/></worldbody><equality><weld body1=\"guide\" body2=\"rh_forearm\"/></equality>",
+    ));
+    let hand = &crate::support::task(&[&model]).hand;
+    assert!(hand.joints.iter().all(|joint| !joint.is_in_loop));
+}
+
+#[test]
+fn a_fingertip_is_a_part_of_the_hand() {
+    let marked = THREE_FINGERS.replace("<freejoint/>", "<freejoint/><site name=\"on the block\"/>");
+    let marked = marked.replace(
+        "</worldbody>",
+        "<site name=\"in the world\"/><body name=\"mark\" mocap=\"true\"/></worldbody>",
+    );
+    for tip in ["world", "block", "on the block", "in the world", "mark"] {
+        let tips = format!("hand.fingertips=[\"α end\", \"{tip}\"]");
+        let said = refusal(&marked, &[&tips]);
+        assert!(
+            said.contains("hand.fingertips must name parts of the hand"),
+            "{tip}: {said}"
+        );
+    }
+}
+
+#[test]
+fn a_name_of_any_length_makes_short_notes() {
+    let name = "n".repeat(10_000);
+    let (folder, model) = placed(&THREE_FINGERS.replace("\"block\"", &format!("\"{name}\"")));
+    let args = ["view", "--plain", "--out", "x.png", "--set", &model];
+    let said = stderr(&program(folder.path(), &args));
+    assert!(said.contains("nnn…") && said.len() < 3000, "{said}");
 }
 
 #[test]

@@ -406,6 +406,11 @@ fn a_trace_that_cannot_be_shown_is_refused_by_its_line() {
         ),
         (changed(&[(1, &older)]), &[], "it has no settings"),
         (
+            changed(&[(3, &"[".repeat(1 << 23))]),
+            &[],
+            "it has a line of more than 4194304 bytes",
+        ),
+        (
             text.clone(),
             &["--set", "env.ctrl_dt=0.02"],
             "a trace has its own settings",

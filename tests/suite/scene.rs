@@ -247,16 +247,6 @@ fn wrong_joints_and_actuators_in_an_own_scene_are_refused() {
             "no body with a free joint",
         ),
         (
-            "joint=\"rh_FFJ3\"/>",
-            "joint=\"rh_FFJ4\"/>",
-            "`rh_A_FFJ3` must drive rh_FFJ3",
-        ),
-        (
-            "joint=\"rh_MFJ1\" coef=\"1\"",
-            "joint=\"rh_MFJ1\" coef=\"2\"",
-            "`rh_A_MFJ0` must drive rh_MFJ1 + rh_MFJ2",
-        ),
-        (
             "ctrlrange=\"0 3.1415\"",
             "",
             "must have one control with a ctrlrange",
