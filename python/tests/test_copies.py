@@ -187,17 +187,10 @@ def test_a_path_that_is_not_utf_8_is_refused_in_a_sentence(value):
             VectorEnv(1, set=set)
 
 
-@pytest.mark.parametrize(
-    ("before", "after"),
-    [
-        ('<joint name="α tip"', '<joint name="\udce9"'), ('<position name="α turns"', '<position name="\udce9"'),
-        ('<body name="block"', '<body name="\udce9"'), ('<key name="cupped"', '<key name="\udce9"'),
-        ('<site name="α end"', '<site name="\udce9"'),
-    ],
-)  # fmt: skip
-def test_a_name_that_is_not_utf_8_is_refused_in_a_sentence(tmp_path, before, after):
-    assert before in HAND, before
+@pytest.mark.parametrize("name", ["α tip", "α turns", "block", "cupped", "α end"])
+def test_a_name_that_is_not_utf_8_is_refused_in_a_sentence(tmp_path, name):
+    assert f'"{name}"' in HAND
     scene = tmp_path / "hand.xml"
-    scene.write_bytes(HAND.replace(before, after, 1).encode(errors="surrogateescape"))
+    scene.write_bytes(HAND.replace(f'"{name}"', '"\udce9"').encode(errors="surrogateescape"))
     with pytest.raises(ValueError, match="UTF-8"):
         VectorEnv(1, set={"env.model": scene})

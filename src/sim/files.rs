@@ -27,8 +27,10 @@ impl SceneFiles {
             return Ok(self.clone());
         }
         let read = |path: PathBuf| Some((path.to_str()?.to_owned(), read_bytes(&path).ok()?));
-        let files = scene_files(scene)?.into_iter().filter_map(read);
-        Ok(Arc::new(Self(files.collect())))
+        let mut known = BTreeSet::new();
+        let files = scene_files(scene)?.into_iter();
+        let each = files.filter(|path| known.insert(path.clone()));
+        Ok(Arc::new(Self(each.filter_map(read).collect())))
     }
 
     /// Whether they are the files of this scene.
