@@ -39,8 +39,8 @@ pub fn hand_meshes(names: &[&str], asked: bool) -> Result<Vec<Vec<u8>>> {
     let failure = cache.join("shadow-hand-meshes.failed");
     let failed = stamp(&failure).and_then(|(_, failed)| failed.elapsed().ok());
     ensure!(
-        asked || failed.is_none_or(|age| age.as_secs() > 24 * 3600),
-        "the meshes of the Shadow Hand could not be fetched less than a day ago"
+        asked || failed.is_none_or(|age| age.as_secs() > 86_400),
+        "the last attempt to get the meshes of the Shadow Hand failed less than a day ago"
     );
     say!("fetching the meshes of the Shadow Hand (8 MB, once)");
     remove_abandoned(&cache);
@@ -51,9 +51,10 @@ pub fn hand_meshes(names: &[&str], asked: bool) -> Result<Vec<Vec<u8>>> {
         )
     };
     let fetched = fetch(&folder, names, if asked { 600 } else { 9 });
-    if fetched.is_err() {
-        let _ = fs::write(failure, "");
-    }
+    let _ = match fetched {
+        Ok(()) => fs::remove_file(failure),
+        Err(_) => fs::write(failure, ""),
+    };
     if folder.exists() {
         fetched.with_context(damaged)?
     } else {
@@ -71,8 +72,8 @@ fn undamaged(folder: &Path, names: &[&str], checksum: u32) -> Option<Vec<Vec<u8>
     files.filter(|files| crc32fast::hash(&files.concat()) == checksum)
 }
 
-/// Unpacks the wheel beside `folder`, within these seconds, and moves the files one by one. Each appears completely or not at all, and
-/// replaces an identical or damaged one.
+/// Unpacks the wheel beside `folder`, within these seconds, and moves the files one by one. Each appears completely or not at all,
+/// and replaces an identical or damaged one.
 fn fetch(folder: &Path, names: &[&str], seconds: u64) -> Result<()> {
     let work = Unfinished::beside(folder);
     // Held as long as the folder is open: others see that somebody fetches into it.
@@ -81,13 +82,11 @@ fn fetch(folder: &Path, names: &[&str], seconds: u64) -> Result<()> {
     let _ = lock.try_lock();
     let wheel = work.path.join("wheel");
     let inside = wheel.join(INSIDE);
-    // Three programs run one after another, and each may wait for ever. One that begins after the end has no time.
-    let mut patience = Duration::from_secs(seconds);
+    // Three programs run one after another, and each may wait for ever. One that begins after the end has a moment.
     let _ = thread::Builder::new().spawn(move || {
-        for _ in 0..3 {
-            thread::sleep(patience);
+        for wait in [1000 * seconds, 100, 100] {
+            thread::sleep(Duration::from_millis(wait));
             pip::stop();
-            patience /= 100;
         }
     });
     let fetched =

@@ -60,7 +60,7 @@ impl Glance {
 /// Fails if the folder cannot be read.
 pub fn folders_of_runs(folder: Option<&Path>, waits: bool) -> Result<Vec<PathBuf>> {
     let path = folder.unwrap_or(Path::new(RUNS));
-    if matches!(path.try_exists(), Ok(false)) {
+    if !path.exists() {
         if waits {
             return Ok(Vec::new());
         }

@@ -91,19 +91,19 @@ fn read(args: &RunsArgs, default: &Config, before: &[Run]) -> Result<Vec<Run>> {
         [] => all(None)?,
         [place] if Glance::of(place).is_none() => all(Some(place))?,
         places => {
-            let expected = places
+            let runs = places
                 .iter()
-                .filter(|place| !args.watch || Glance::of(place).is_some());
-            let runs = expected.map(|place| {
-                ensure!(place.exists(), "{}: no such folder", place.display());
-                let no_run = || {
-                    format!(
-                        "{} holds no run; to list a folder of runs, name it alone",
-                        place.display()
-                    )
-                };
-                seen(place.clone()).with_context(no_run)
-            });
+                .filter(|place| !args.watch || Glance::of(place).is_some())
+                .map(|place| {
+                    ensure!(place.exists(), "{}: no such folder", place.display());
+                    let no_run = || {
+                        format!(
+                            "{} holds no run; to list a folder of runs, name it alone",
+                            place.display()
+                        )
+                    };
+                    seen(place.clone()).with_context(no_run)
+                });
             runs.collect::<Result<_>>()?
         }
     };

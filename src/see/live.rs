@@ -99,7 +99,7 @@ impl Live {
             "the hand is at http://127.0.0.1:{port}/{token} (Ctrl-C ends)\n\
              from another machine: ssh -L {port}:127.0.0.1:{port} {machine}, and the same address there"
         );
-        if let (_, Some(host)) = place {
+        if let Some(host) = place.1 {
             os::say!("by a proxy: its address at {host} for port {port}, with {token} at the end");
         }
         Ok(Self {
