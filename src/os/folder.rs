@@ -2,7 +2,6 @@
 
 use std::fs::{self, File};
 use std::os::fd::AsRawFd;
-use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -37,7 +36,7 @@ impl Folder {
     /// Fails if it cannot be created or opened, or if something else has the name of a deleted one.
     pub fn hold(&mut self) -> Result<()> {
         let created = match &self.handle {
-            Some(handle) if self.leads_to(handle) => return Ok(()),
+            Some(handle) if self.is_alive(handle) => return Ok(()),
             Some(_) => fs::create_dir(&self.name),
             None => fs::create_dir_all(&self.name),
         };
@@ -45,27 +44,34 @@ impl Folder {
         let handle = File::open(&self.name).cannot("open", &self.name)?;
         self.path = Path::new(HANDLES).join(handle.as_raw_fd().to_string());
         // Where the system lists no handles, the name must do.
-        if !self.leads_to(&handle) {
+        if !self.path.is_dir() {
             self.path.clone_from(&self.name);
         }
         self.handle = Some(Arc::new(handle));
         Ok(())
     }
 
-    /// Whether the path leads to this open folder, and the folder was not deleted.
-    fn leads_to(&self, handle: &File) -> bool {
-        let exists = handle.metadata().is_ok_and(|facts| facts.nlink() > 0);
-        exists && expect_named(&self.path, handle).is_ok()
+    /// Whether the path leads to this open folder, and the folder was not deleted. Not all file systems count the names of a folder, or
+    /// number it the same each time.
+    fn is_alive(&self, handle: &File) -> bool {
+        match self.link() {
+            Some(place) => !place.to_string_lossy().ends_with(" (deleted)") || place.exists(),
+            None => expect_named(&self.path, handle).is_ok(),
+        }
+    }
+
+    /// Where the system says that the held folder lies.
+    fn link(&self) -> Option<PathBuf> {
+        let is_through = self.path.starts_with(HANDLES);
+        is_through.then(|| fs::read_link(&self.path).ok()).flatten()
     }
 
     /// The path where the folder lies now: its name, unless it was moved.
     pub fn place(&self) -> PathBuf {
-        match &self.handle {
-            Some(handle) if expect_named(&self.name, handle).is_err() => {
-                fs::read_link(&self.path).unwrap_or_else(|_| self.name.clone())
-            }
-            _ => self.name.clone(),
-        }
+        let moved = self
+            .link()
+            .filter(|place| self.name.canonicalize().ok().as_ref() != Some(place));
+        moved.unwrap_or_else(|| self.name.clone())
     }
 }
 

@@ -7,10 +7,10 @@
 //! holds means that the training run has failed or was killed.
 
 use std::fs::{self, File, OpenOptions, TryLockError};
-use std::io::Read;
+use std::io::{self, Read};
 use std::os::unix::fs::{FileExt, MetadataExt};
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
+use std::sync::{Arc, LazyLock};
 use std::thread;
 use std::time::{Duration, Instant, SystemTime};
 
@@ -102,15 +102,14 @@ impl Locked {
         } else {
             name()
         };
-        let cleared = self.file.set_len(0);
-        nicety(cleared.and_then(|()| self.file.write_all_at(said.as_bytes(), 0)));
+        nicety(write(&self.file, &said));
         Ok(self)
     }
 
     /// Releases the lock and removes the name of this program, after a training run that ended normally.
     pub fn release(self) {
         // The file may belong to another program by now.
-        if holder(&self.path) == name() {
+        if !taken(&self.path) {
             nicety(self.file.set_len(0));
         }
     }
@@ -136,9 +135,8 @@ impl Locked {
     /// # Errors
     /// Fails with the name of the other program.
     pub fn expect_own(&self) -> Result<()> {
-        let taken = self.heart.is_some() && holder(&self.path) != name();
         ensure!(
-            !taken,
+            self.heart.is_none() || !taken(&self.path),
             in_use(self.path.parent().unwrap_or(&self.path), &self.path)
         );
         Ok(())
@@ -148,8 +146,8 @@ impl Locked {
 impl Drop for Locked {
     fn drop(&mut self) {
         // The name stays, as in a file that was locked. Without a heartbeat, the next training need not wait.
-        if self.heart.is_some() && holder(&self.path) == name() {
-            nicety(self.file.set_len(name().len() as u64));
+        if self.heart.is_some() && !taken(&self.path) {
+            nicety(write(&self.file, &name()));
         }
     }
 }
@@ -161,7 +159,7 @@ impl Drop for Locked {
 fn beat_in(folder: &Path, path: &Path) -> Result<Arc<()>> {
     let found = content(path);
     let watching = Instant::now();
-    while has_beat(&found) && watching.elapsed() < WATCHED {
+    while has_beat(&found) && taken(path) && watching.elapsed() < WATCHED {
         thread::sleep(BEAT / 4);
         ensure!(
             content(path) == found,
@@ -169,9 +167,13 @@ fn beat_in(folder: &Path, path: &Path) -> Result<Arc<()>> {
             in_use(folder, path)
         );
     }
-    fs::write(path, beat(0)).cannot("write", path)?;
+    let beat_at = |path: &Path, number| {
+        let opened = File::options().write(true).open(path);
+        opened.and_then(|file| write(&file, &beat(number)))
+    };
+    beat_at(path, 0).cannot("write", path)?;
     thread::sleep(SETTLED);
-    ensure!(holder(path) == name(), in_use(folder, path));
+    ensure!(!taken(path), in_use(folder, path));
     say!(
         "note: there are no file locks in {}; a heartbeat in {LOCK} replaces them",
         shown(folder).display()
@@ -183,11 +185,10 @@ fn beat_in(folder: &Path, path: &Path) -> Result<Arc<()>> {
         for number in 1.. {
             thread::sleep(BEAT);
             // The folder may belong to another program by now.
-            if alive.strong_count() == 0 || holder(&file) != name() {
+            if alive.strong_count() == 0 || taken(&file) {
                 return;
             }
-            let opened = File::options().write(true).open(&file);
-            nicety(opened.and_then(|file| file.write_all_at(beat(number).as_bytes(), 0)));
+            nicety(beat_at(&file, number));
         }
     };
     thread::Builder::new()
@@ -196,14 +197,26 @@ fn beat_in(folder: &Path, path: &Path) -> Result<Arc<()>> {
     Ok(lives)
 }
 
-/// What the lock file contains at this heartbeat. The length is always the same.
+/// What the lock file contains at this heartbeat.
 fn beat(number: u64) -> String {
-    format!("{}\n{number:020}", name())
+    format!("{}\nheartbeat {number}", name())
 }
 
 /// Whether the content of a lock file has a heartbeat.
 fn has_beat(content: &str) -> bool {
-    content.contains('\n')
+    content.contains("\nheartbeat ")
+}
+
+/// Replaces the content of a lock file. At no moment is it empty.
+fn write(file: &File, content: &str) -> io::Result<()> {
+    file.write_all_at(content.as_bytes(), 0)?;
+    file.set_len(content.len() as u64)
+}
+
+/// Whether a lock file has the name of another program. One that is gone, empty or cannot be read just now has none.
+fn taken(path: &Path) -> bool {
+    let content = content(path);
+    !content.is_empty() && !content.starts_with(&name())
 }
 
 /// What the lock file of a run folder shows to a reader.
@@ -266,12 +279,15 @@ fn content(path: &Path) -> String {
     content
 }
 
-/// The name of this program, as lock files are signed with it.
+/// What this program signs lock files with: a line that names it, and a number that no other process of this name has, e.g. in
+/// another container.
 fn name() -> String {
+    static OWN: LazyLock<u64> = LazyLock::new(rand::random);
     format!(
-        ": process {} on {}",
+        ": process {} on {}\nnumber {:016x}",
         std::process::id(),
-        Machine::this().name
+        Machine::this().name,
+        *OWN
     )
 }
 
@@ -341,7 +357,7 @@ mod tests {
         fs::write(&path, "").unwrap();
         fs::hard_link(&path, place.path().join("copy")).unwrap();
         let lock = beating(place.path()).unwrap();
-        assert_eq!(holder(&path), name());
+        assert!(has_beat(&content(&path)) && !taken(&path));
         drop(lock);
         assert_eq!(content(&path), name(), "it has failed");
         let begun = Instant::now();
@@ -360,16 +376,43 @@ mod tests {
     fn where_there_are_no_locks_a_heart_that_beats_keeps_others_out_whatever_the_date_is() {
         let place = tempfile::tempdir().unwrap();
         let path = place.path().join(LOCK);
+        // Another container may have the same name and the same process id.
+        let same = name().lines().next().unwrap().to_owned();
+        let beats = (0..).map(move |number| format!("{same}\nnumber 7\nheartbeat {number}"));
         fs::write(&path, "").unwrap();
-        let _lock = beating(place.path()).unwrap();
-        let long_ago = SystemTime::UNIX_EPOCH;
-        File::open(&path).unwrap().set_modified(long_ago).unwrap();
+        let file = path.clone();
+        let other = thread::spawn(move || {
+            for content in beats.take(8) {
+                let file = File::options().write(true).open(&file).unwrap();
+                write(&file, &content).unwrap();
+                file.set_modified(SystemTime::UNIX_EPOCH).unwrap();
+                thread::sleep(BEAT / 4);
+            }
+        });
+        thread::sleep(BEAT / 8);
         let refusal = beating(place.path()).unwrap_err().to_string();
         assert!(
             refusal.contains("is in use") && refusal.contains("changes"),
             "{refusal}"
         );
-        assert_eq!(holder(&path), name(), "nothing was written");
+        other.join().unwrap();
+        assert!(content(&path).contains("number 7"), "nothing was written");
+    }
+
+    #[test]
+    fn where_there_are_no_locks_a_lock_file_that_is_lost_or_cannot_be_read_is_nobodys() {
+        let place = tempfile::tempdir().unwrap();
+        let path = place.path().join(LOCK);
+        fs::write(&path, "").unwrap();
+        let lock = beating(place.path()).unwrap();
+        fs::write(&path, "").unwrap();
+        assert!(lock.holds());
+        thread::sleep(2 * BEAT);
+        assert!(has_beat(&content(&path)), "the heart goes on");
+        fs::remove_file(&path).unwrap();
+        assert!(lock.expect_own().is_ok() && !lock.holds());
+        fs::write(&path, "").unwrap();
+        beating(place.path()).unwrap();
     }
 
     #[test]

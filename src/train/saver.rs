@@ -201,6 +201,8 @@ impl Saver {
     /// # Errors
     /// Fails if the folder cannot be written to.
     pub fn save(&mut self, report: &mut Report) -> Result<()> {
+        // What could not be done after the first iteration comes first now.
+        self.open_folder(report)?;
         self.own_folder(report)?;
         report.sync();
         self.describe()?;
