@@ -9,7 +9,9 @@ use std::process::Stdio;
 
 use shadow_repose::ppo::Checkpoint;
 
-use crate::support::{SCENE, command, metrics, names, program, stderr, succeeded, train};
+use crate::support::{
+    SCENE, command, metrics, names, preloaded, program, stderr, succeeded, train,
+};
 use crate::survival::{iterations, result, resume};
 
 /// Trains a run of ten iterations in `run` and keeps all its checkpoints.
@@ -139,6 +141,39 @@ fn a_run_that_is_resumed_is_left_as_it_was_until_an_iteration_is_done() {
     );
     succeeded(resume(folder, &["--total-steps", "49152"]));
     assert!(result(folder, "run") == expected);
+}
+
+#[test]
+fn a_run_that_is_resumed_where_nothing_can_be_saved_is_left_as_it_was() {
+    let place = tempfile::tempdir().unwrap();
+    let folder = place.path();
+    let refusing = "#include <errno.h>\n\
+        int rename(const char *a, const char *b) { (void)a; (void)b; errno = EIO; return -1; }\n";
+    let Some(library) = preloaded(folder, refusing) else {
+        return;
+    };
+    succeeded(program(
+        folder,
+        &train(&["--total-steps", "512", "--run-dir", "run"]),
+    ));
+    let of_run = || {
+        let mut files = everything(&folder.join("run"));
+        files.retain(|name, _| !name.contains("run.lock"));
+        files
+    };
+    let before = of_run();
+    let mut resumed = command(
+        folder,
+        &["train", "--resume", "run", "--total-steps", "1024"],
+    );
+    let output = resumed.env("LD_PRELOAD", library).output().unwrap();
+    assert_eq!(output.status.code(), Some(1));
+    assert!(
+        stderr(&output).contains("cannot write run/"),
+        "{}",
+        stderr(&output)
+    );
+    assert!(of_run() == before);
 }
 
 #[test]
