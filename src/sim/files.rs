@@ -1,11 +1,17 @@
 //! Which files a scene reads.
 
 use std::collections::BTreeSet;
+use std::ffi::OsString;
+use std::os::unix::ffi::OsStringExt;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use anyhow::{Result, ensure};
 use mujoco_rs::wrappers::mj_auxiliary::MjVfs;
+use quick_xml::Reader;
+use quick_xml::escape::unescape;
+use quick_xml::events::Event;
+use quick_xml::events::attributes::Attribute;
 
 use crate::os::read_bytes;
 
@@ -69,13 +75,13 @@ pub fn scene_files(scene: &Path) -> Result<Vec<PathBuf>> {
         let near = [folder_of(&own), folder_of(scene)];
         // What is no XML names no files.
         let bytes = read_bytes(&own).unwrap_or_default();
-        for (element, name, value) in attributes(&String::from_utf8_lossy(&bytes)) {
-            let places = near.clone().map(|folder| folder.join(value));
-            if element == "compiler" && name.ends_with("dir") {
+        for (element, name, value) in attributes(&bytes) {
+            let places = near.clone().map(|folder| folder.join(&value));
+            if element == b"compiler" && name.ends_with(b"dir") {
                 folders.extend(places);
-            } else if name.starts_with("file") {
-                named.push((near.clone(), value.to_owned()));
-                if ["include", "model"].contains(&element) {
+            } else if name.starts_with(b"file") {
+                named.push((near.clone(), value));
+                if [&b"include"[..], b"model"].contains(&&*element) {
                     let is_new =
                         |path: &PathBuf| path.canonicalize().is_ok_and(|end| known.insert(end));
                     scenes.extend(places.into_iter().filter(is_new));
@@ -85,7 +91,7 @@ pub fn scene_files(scene: &Path) -> Result<Vec<PathBuf>> {
     }
     for (near, name) in &named {
         // With `strippath`, only the last part of a name counts.
-        let last = name.rsplit('/').next().unwrap_or_default();
+        let last = Path::new(name).file_name().unwrap_or(name);
         let folders = near.iter().chain(folders.iter().rev().take(MOST_FOLDERS));
         for path in folders.flat_map(|folder| [name, last].map(|name| folder.join(name))) {
             let Ok(facts) = path.metadata() else { continue };
@@ -100,26 +106,36 @@ pub fn scene_files(scene: &Path) -> Result<Vec<PathBuf>> {
     Ok(files)
 }
 
-/// The attributes in a text: the names of their elements, their own names, and their values. Comments are left out.
-fn attributes(text: &str) -> impl Iterator<Item = (&str, &str, &str)> {
-    let word = |c: char| !c.is_alphanumeric();
-    let mut is_comment = false;
-    let elements = text.split('<').filter(move |element| {
-        is_comment |= element.starts_with("!--");
-        let is_left_out = is_comment;
-        is_comment &= !element.contains("-->");
-        !is_left_out
-    });
-    elements.flat_map(move |element| {
-        element.match_indices('=').filter_map(move |(at, _)| {
-            let name = element[..at].trim_end().rsplit(word).next()?;
-            let value = element[at + 1..].trim_start();
-            let quote = value.chars().next().filter(|c| "\"'".contains(*c))?;
-            Some((
-                element.split(word).next()?,
-                name,
-                value[1..].split(quote).next()?,
-            ))
-        })
-    })
+/// The attributes in a scene, up to where it is no XML: the names of their elements, their own names, and their values.
+fn attributes(scene: &[u8]) -> Vec<(Vec<u8>, Vec<u8>, OsString)> {
+    let mut reader = Reader::from_reader(scene);
+    reader.config_mut().check_end_names = false;
+    reader.config_mut().allow_dangling_amp = true;
+    let mut found = Vec::new();
+    while let Ok(event) = reader.read_event() {
+        let element = match event {
+            Event::Start(element) | Event::Empty(element) => element,
+            Event::Eof => break,
+            _ => continue,
+        };
+        for Attribute { key, value } in element.attributes().with_checks(false).flatten() {
+            let name = key.as_ref().to_vec();
+            found.push((element.name().as_ref().to_vec(), name, path_of(&value)));
+        }
+    }
+    found
+}
+
+/// The path that a value of an attribute stands for. MuJoCo takes a backslash for a slash.
+fn path_of(value: &[u8]) -> OsString {
+    let meant = str::from_utf8(value)
+        .ok()
+        .and_then(|text| unescape(text).ok());
+    let bytes = meant.map_or(value.to_vec(), |text| text.into_owned().into_bytes());
+    OsString::from_vec(
+        bytes
+            .iter()
+            .map(|&byte| if byte == b'\\' { b'/' } else { byte })
+            .collect(),
+    )
 }

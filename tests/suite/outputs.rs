@@ -789,7 +789,7 @@ fn no_output_replaces_what_is_read_or_what_a_run_keeps() {
 fn no_output_replaces_a_file_that_a_scene_reads() {
     let place = tempfile::tempdir().unwrap();
     let folder = place.path();
-    ["scenes/parts", "scenes/meshes"]
+    ["scenes/parts", "scenes/meshes/in"]
         .iter()
         .for_each(|inner| fs::create_dir_all(folder.join(inner)).unwrap());
     let scene = SCENE.replacen(
@@ -798,10 +798,13 @@ fn no_output_replaces_a_file_that_a_scene_reads() {
         1,
     );
     fs::write(folder.join("scenes/s.xml"), &scene).unwrap();
-    let more = "<mujoco><asset><mesh name=\"m\"\n file = \"m.obj\"/></asset></mujoco>";
+    let more = "<mujoco><!-- <a --><asset><mesh name=\"m\"\n file = \"m.obj\"/>\
+        <mesh name=\"<!--\" file=\"in\\a&amp;&#98;.obj\"/></asset></mujoco>";
     fs::write(folder.join("scenes/parts/more.svg"), more).unwrap();
     let corners = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n";
-    fs::write(folder.join("scenes/meshes/m.obj"), corners).unwrap();
+    for name in ["m.obj", "in/a&b.obj"] {
+        fs::write(folder.join("scenes/meshes").join(name), corners).unwrap();
+    }
     std::os::unix::fs::symlink("scenes/meshes/m.obj", folder.join("link")).unwrap();
     let play = [
         "play",
@@ -811,7 +814,7 @@ fn no_output_replaces_a_file_that_a_scene_reads() {
         "--set",
         "env.max_episode_seconds=0.1",
     ];
-    let refused: [(&[&str], &[&str], &str); 4] = [
+    let refused: [(&[&str], &[&str], &str); 5] = [
         (
             &["export", "--ckpt", "builtin"],
             &["--out", "scenes/parts/more.svg"],
@@ -825,6 +828,11 @@ fn no_output_replaces_a_file_that_a_scene_reads() {
         (
             &play,
             &["--out", "html:scenes/meshes/m.obj", "--ckpt", "zero"],
+            "s.xml",
+        ),
+        (
+            &play,
+            &["--out", "html:scenes/meshes/in/a&b.obj", "--ckpt", "zero"],
             "s.xml",
         ),
         (
