@@ -1,7 +1,7 @@
 //! Environments that step together.
 
 use std::path::PathBuf;
-use std::sync::{Mutex, MutexGuard, TryLockError};
+use std::sync::{Arc, Mutex, MutexGuard, TryLockError};
 
 use anyhow::{Context, ensure};
 use numpy::{
@@ -16,14 +16,14 @@ use shadow_repose::config::{Config, EnvConfig, PpoConfig};
 use shadow_repose::env::{Autoreset, End, EnvPool, EnvState};
 use shadow_repose::ranks::Exchange;
 use shadow_repose::repose::{
-    EpisodeStats, Lesson, Randomization, Repose, TaskReward, TrainingReward, task_terms,
+    EpisodeStats, Lesson, Randomization, Repose, Task, TaskReward, TrainingReward, task_terms,
     training_terms,
 };
 use shadow_repose::sim::mujoco_version;
 
 use crate::episodes::columns;
 use crate::errors::{guarded, refused};
-use crate::pictures::Painter;
+use crate::pictures::{self, picture};
 use crate::policy::Policy;
 use crate::settings::{Made, Parts, Set, of_world, overrides, resolve, text};
 use crate::workers::Workers;
@@ -49,7 +49,8 @@ pub(crate) struct Hands {
 struct State {
     pool: EnvPool<Repose>,
     workers: Workers,
-    painter: Option<Painter>,
+    /// The task on display, once pictures were asked for.
+    shown: Option<Arc<Task>>,
     /// Control steps of all environments together. In a training they determine the lesson.
     env_steps: u64,
     /// The number of steps at which the current lesson began, if there is one.
@@ -396,7 +397,7 @@ impl Hands {
         let state = State {
             pool,
             workers,
-            painter: None,
+            shown: None,
             env_steps: 0,
             lesson_from: None,
             observations: vec![0.0; count * made.task.spaces().observation_size],
@@ -765,18 +766,19 @@ impl Hands {
         let mut guard = self.locked()?;
         let state = guard.as_mut().expect("not closed");
         state.can_step.map_err(PyRuntimeError::new_err)?;
-        let State { pool, painter, .. } = state;
+        let State { pool, shown, .. } = state;
         let draw = || -> anyhow::Result<Vec<Vec<u8>>> {
-            let painter = Painter::of_this_process(painter, &self.made.task)?;
+            let own = match shown.take() {
+                Some(own) => own,
+                None => pictures::shown(&self.made.task)?,
+            };
+            let own = shown.insert(own);
             let states = pool.envs_mut().map(|hand| hand.sim.state());
-            states.map(|state| painter.draw(state)).collect()
+            states.map(|state| picture(own, state)).collect()
         };
         let pictures = py.detach(|| guarded(draw))?;
-        if pictures.is_err() {
-            *painter = None;
-        }
         let pictures = pictures.map_err(|error| PyRuntimeError::new_err(format!("{error:#}")))?;
-        let [width, height] = Painter::SIZE.map(|pixels| pixels as usize);
+        let [width, height] = pictures::SIZE.map(|pixels| pixels as usize);
         pictures
             .into_iter()
             .map(|picture| picture.into_pyarray(py).reshape([height, width, 3]))

@@ -175,6 +175,44 @@ def test_a_drawing_does_not_change_what_comes():
 
 
 @drawn
+def test_environments_that_were_drawn_and_closed_are_freed():
+    def resident():
+        with open("/proc/self/status") as status:
+            return int(next(line for line in status if line.startswith("VmRSS")).split()[1]) / 1024
+
+    def draw():
+        envs = VectorEnv(1, threads=1, render_mode="rgb_array")
+        envs.reset()
+        envs.render()
+        envs.close()
+
+    draw()
+    draw()
+    before = resident()
+    for _ in range(12):
+        draw()
+    assert resident() - before < 120, "MiB; each drawing takes 24"
+
+
+@drawn
+def test_a_fork_of_a_process_that_has_drawn_says_that_it_cannot():
+    program = """if True:
+        import os, sys
+        from shadow_repose import VectorEnv
+        envs = VectorEnv(1, render_mode="rgb_array")
+        envs.reset()
+        envs.render()
+        if os.fork() == 0:
+            try:
+                envs.render()
+            except RuntimeError as error:
+                os._exit(7 if "a fork of a process" in str(error) else 1)
+        sys.exit(os.waitstatus_to_exitcode(os.wait()[1]))
+    """
+    assert subprocess.run([sys.executable, "-c", program], timeout=60).returncode == 7
+
+
+@drawn
 def test_gymnasium_records_a_film(tmp_path):
     pytest.importorskip("moviepy")
     env = gymnasium.make("ShadowRepose-v0", render_mode="rgb_array", set=SHORT)
