@@ -57,6 +57,7 @@ impl Trace {
             "vel_obs_scale": config.vel_obs_scale,
             "mirror_matrix": mirror,
         });
+        header["warnings"] = json!(task.warnings);
         header["prediction"] = json!(config.prediction);
         header["predicted_with"] = json!(task.predicted_with().map(physical));
         add_settings(config, &mut header);

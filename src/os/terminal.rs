@@ -42,9 +42,6 @@ pub fn is_read(text: &str) -> Result<bool> {
 /// The most characters of a foreign text that a message quotes.
 const LONGEST_QUOTE: usize = 100;
 
-/// The most bytes of a word in a message. A name in a scene may have any number, but a name in a path has at most 255.
-const LONGEST_WORD: usize = 300;
-
 /// A text from an untrusted file, short enough for a message and on one line.
 pub fn shortened(text: &str) -> String {
     let shown = |c: char| {
@@ -129,17 +126,7 @@ pub(crate) use say;
 /// Prints a line to stderr, and does not wait for a reader. Characters that control the terminal are escaped, since the line may quote an untrusted file.
 pub fn say_line(line: &str) {
     let speaker = SPEAKER.get().map_or("", String::as_str);
-    let short = |word: &str| {
-        let name = word.trim_end();
-        if name.len() <= LONGEST_WORD {
-            word.to_owned()
-        } else {
-            shortened(name) + &word[name.len()..]
-        }
-    };
-    let words = line.split_inclusive([' ', '/', '\n']);
-    let line: String = words.map(short).collect();
-    let harmless = escaped(&line, "\n\t", |c| c.escape_unicode().to_string());
+    let harmless = escaped(line, "\n\t", |c| c.escape_unicode().to_string());
     say_text(format!("{speaker}{harmless}\n"));
 }
 

@@ -8,7 +8,7 @@ use anyhow::{Context, Result, bail, ensure};
 use serde_json::{Value, json};
 use toml::Table;
 
-use super::stage::Stage;
+use super::stage::{Stage, with_warnings};
 use crate::config::{MODEL, Override, Reader, Settings, Source, short};
 use crate::load::PolicySource;
 use crate::os::{self, Destination, Place, Stamp, say};
@@ -197,15 +197,25 @@ pub fn from_trace(
             path.display()
         );
     }
+    page.finish(&of_trace(&header))?;
+    Ok(ExitCode::SUCCESS)
+}
+
+/// What a page says about who acts in a trace with this header. Tells the user where the policy did not fit well.
+fn of_trace(header: &Value) -> About {
     let actor = header["actor"]
         .as_str()
         .filter(|actor| actor.is_ascii() && !actor.is_empty())
         .unwrap_or("policy");
-    let policy = header["checkpoint"]
-        .as_str()
-        .map(|place| (place.to_owned(), place));
-    page.finish(&described(actor, policy, header["seed"].as_u64()))?;
-    Ok(ExitCode::SUCCESS)
+    let warnings = header["warnings"].as_array().into_iter().flatten();
+    let warnings: Vec<&str> = warnings.filter_map(Value::as_str).collect();
+    warnings
+        .iter()
+        .for_each(|warning| say!("warning: {warning}"));
+    let policy = header["checkpoint"].as_str();
+    let name = policy.map(|place| with_warnings(place, warnings.iter().copied()));
+    let policy = policy.map(str::to_owned).zip(name.as_deref());
+    described(actor, policy, header["seed"].as_u64())
 }
 
 /// The first record of a trace.

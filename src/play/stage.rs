@@ -119,10 +119,8 @@ impl Stage {
 
     /// What a page says of the policy: its description, and where it does not fit well.
     pub fn described(&self) -> Option<String> {
-        let loaded = self.loaded()?;
-        let warnings = self.task.warnings.iter();
-        let warnings = warnings.map(|warning| format!("; warning: {warning}"));
-        Some(loaded.name.clone() + &warnings.collect::<String>())
+        let warnings = self.task.warnings.iter().map(String::as_str);
+        Some(with_warnings(&self.loaded()?.name, warnings))
     }
 
     /// The actor of a page that shows this task.
@@ -170,4 +168,11 @@ fn expect_outputs(out: &[Destination], policy: Option<&Path>, scene: Option<&Pat
         );
     }
     Ok(())
+}
+
+/// What a page says of a policy: its name, and where it does not fit well.
+pub fn with_warnings<'a>(name: &str, warnings: impl Iterator<Item = &'a str>) -> String {
+    warnings.fold(name.to_owned(), |text, warning| {
+        text + "; warning: " + warning
+    })
 }

@@ -10,6 +10,7 @@ use std::fmt::Display;
 use std::path::Path;
 use std::ptr;
 use std::sync::Arc;
+use std::thread;
 
 use anyhow::{Context, Error, Result, anyhow, bail, ensure};
 use mujoco_rs::mujoco_c::{mj_deleteSpec, mj_parseXML};
@@ -61,6 +62,9 @@ pub struct Compilation {
     pub files: Arc<SceneFiles>,
 }
 
+/// The most bytes of a name in a scene. Messages quote names.
+const LONGEST_NAME: usize = 255;
+
 impl Compilation {
     /// The compilation that keeps all of a scene but its timestep in s and its friction cones.
     pub fn plain(timestep: f64, cone: Cone) -> Self {
@@ -103,16 +107,20 @@ impl Compilation {
     /// Compiles a scene that was read.
     ///
     /// # Errors
-    /// Fails with MuJoCo's own message if MuJoCo refuses the scene, or if a name is not UTF-8.
+    /// Fails with MuJoCo's own message if MuJoCo refuses the scene, or if a name is not UTF-8 or very long.
     pub(super) fn finish(&self, mut spec: MjSpec) -> Result<MjModel> {
+        // MuJoCo compiles on threads, and ends the process if the system refuses one.
+        let thread = thread::Builder::new().spawn(|| ());
+        thread.context("the system refuses a thread")?;
         let model = spec
             .compile_with_vfs(&self.files.for_mujoco())
             .map_err(refused)?;
         // The wrapper returns names as text, whatever their bytes are.
-        let names = model.names().iter().map(|&byte| byte as u8).collect();
+        let names: Vec<u8> = model.names().iter().map(|&byte| byte as u8).collect();
+        let is_name = |name: &[u8]| name.len() <= LONGEST_NAME && str::from_utf8(name).is_ok();
         ensure!(
-            String::from_utf8(names).is_ok(),
-            "a name in it is not UTF-8; save the scene as UTF-8"
+            names.split(|&byte| byte == 0).all(is_name),
+            "a name in it is not UTF-8, or has more than {LONGEST_NAME} bytes"
         );
         Ok(model)
     }

@@ -769,7 +769,7 @@ fn what_a_policy_or_a_scene_says_is_cut_to_a_hundred_characters() {
             "env.model=s.xml",
             "--headless",
         ],
-        "s.xml: geom_friction of geom `999",
+        "s.xml: a name in it is not UTF-8, or has more than 255 bytes",
     );
     // The path that a user names stays whole.
     brief(
