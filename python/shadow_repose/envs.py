@@ -233,14 +233,14 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         Raises ValueError if it is the state of other environments: of another number of them, another scene, or other settings.
         """
         try:
-            parts = [np.asarray(state[name], kind) for name, (kind, _) in _STATE.items()]
+            parts = [np.asarray(state[name]) for name in _STATE]
             task = state["task"]
         except KeyError as missing:
             raise ValueError(f"the state lacks {missing}") from None
-        dimensions = [part.ndim for part in parts]
-        expected = [count for _, count in _STATE.values()]
-        if dimensions != expected:
-            raise ValueError(f"the parts of the state have {dimensions} dimensions, expected {expected}")
+        found = [(part.dtype.str, part.ndim) for part in parts]
+        expected = [(np.dtype(kind).str, dimensions) for kind, dimensions in _STATE.values()]
+        if found != expected:
+            raise ValueError(f"the parts of the state have the types and dimensions {found}, expected {expected}")
         if len(parts[0]) == self.num_envs and not np.array_equal(task, self._task):
             raise ValueError("not a state of such hands: it belongs to other settings or to another scene")
         return self._open().set_state(*parts)

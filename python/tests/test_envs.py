@@ -100,7 +100,11 @@ def test_a_state_of_other_hands_is_refused_and_then_the_hands_must_be_reset():
     state = envs.get_state()
     other = VectorEnv(5)
     other.reset()
-    for wrong in (other.get_state(), {}, {**state, "numbers": state["numbers"][:, :-1]}, {**state, "ends": state["ends"] + 9}):
+    rounded, negative = state["numbers"].astype(np.float32), state["seeds"].astype(np.int64) - 9
+    for wrong in (
+        other.get_state(), {}, {**state, "numbers": rounded}, {**state, "seeds": negative},
+        {**state, "numbers": state["numbers"][:, :-1]}, {**state, "ends": state["ends"] + 9},
+    ):
         with pytest.raises(ValueError):
             envs.set_state(wrong)
     with pytest.raises(RuntimeError, match="could not be set"):
