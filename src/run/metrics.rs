@@ -102,7 +102,8 @@ impl Metrics {
 
     /// Cuts off a row that was written only in part.
     fn repair(&mut self) -> std::io::Result<()> {
-        if self.file.metadata()?.is_file() {
+        let facts = self.file.metadata()?;
+        if facts.is_file() && facts.len() != self.length {
             self.file.set_len(self.length)?;
         }
         self.file.seek(SeekFrom::Start(self.length)).map(drop)
