@@ -19,7 +19,9 @@ use crate::sim::{self, Camera, Look, Quality};
 pub use results::{Along, PlotArgs, RunsArgs};
 use together::given;
 pub use together::{Made, expect_together};
-use values::{camera, count, destination, quality, seconds, seed, size, steps, threads, time};
+use values::{
+    camera, count, destination, host, quality, seconds, seed, size, steps, threads, time,
+};
 
 // The groups of options in the help.
 const SETTINGS: &str = "Settings";
@@ -323,7 +325,7 @@ pub struct ShotArgs {
     pub web: Option<u16>,
     /// Host name by which a proxy asks for the page of --web, such as jupyter-server-proxy or Open OnDemand. The page is then served on
     /// all addresses of this machine, and each request needs the token in the address that is printed
-    #[arg(long, value_name = "NAME", help_heading = OUTPUT)]
+    #[arg(long, value_name = "NAME", value_parser = host, help_heading = OUTPUT)]
     pub web_host: Option<String>,
     /// Viewing direction in degrees and distance in m, e.g. 150,-27,0.66
     #[arg(long, value_name = "AZIMUTH,ELEVATION,DISTANCE", value_parser = camera, allow_hyphen_values = true, help_heading = PICTURE)]

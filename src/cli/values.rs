@@ -88,6 +88,13 @@ pub fn time(text: &str) -> Result<Duration, String> {
         .ok_or_else(|| "must be a time above 0, e.g. 2d, 3h50m, 90m, 30s or 1-12:00:00".into())
 }
 
+pub fn host(text: &str) -> Result<String, String> {
+    let is_name = |c: char| c.is_ascii_alphanumeric() || "-._".contains(c);
+    let is_host = !text.is_empty() && text.chars().all(is_name);
+    let advice = "must be a host name without a port, such as hub.example.org";
+    is_host.then(|| text.into()).ok_or(advice.into())
+}
+
 pub fn quality() -> impl TypedValueParser<Value = Quality> {
     // Shells complete them.
     PossibleValuesParser::new(["fast", "high"]).map(|text| {

@@ -86,11 +86,11 @@ impl Request {
         })
     }
 
-    /// The value of a header, unless it is there more than once.
+    /// The value of a header, or an empty one if it is there more than once.
     fn header(&self, name: &str) -> Option<&str> {
         let mut found = self.headers.iter().filter(|(own, _)| own == name);
         let (_, value) = found.next()?;
-        found.next().is_none().then_some(value)
+        Some(if found.next().is_none() { value } else { "" })
     }
 
     /// The length of the body in bytes.
@@ -127,11 +127,12 @@ impl Request {
             .ok_or(("403 Forbidden", sentence))
     }
 
-    /// Checks that the page or its user asks, and not a page of another origin in the same browser.
+    /// Checks that the page or its user asks, and not a page of another origin in the same browser. A request that is `proxied` does
+    /// not have the host that the browser has asked.
     ///
     /// # Errors
     /// Fails with the answer to send.
-    pub fn expect_own(&self) -> Result<(), Refusal> {
+    pub fn expect_own(&self, proxied: bool) -> Result<(), Refusal> {
         // This content type makes a browser ask before it sends the request from another origin. Such a question is not answered.
         let is_json = self
             .header("content-type")
@@ -139,7 +140,7 @@ impl Request {
         let reads = self.method == "GET";
         let is_own = match (self.header("sec-fetch-site"), self.header("origin")) {
             (Some(site), _) => ["same-origin", "none"].contains(&site),
-            (None, Some(origin)) => origin.split("://").nth(1) == self.header("host"),
+            (None, Some(origin)) => proxied || origin.split("://").nth(1) == self.header("host"),
             // A page that sends says where it is from.
             (None, None) => reads,
         };
@@ -305,7 +306,7 @@ mod tests {
         let allowed = |path: &str, lines: &[&str]| {
             let line = format!("GET {path} HTTP/1.1");
             let all = [&[&*line, "Host: localhost:1"], lines].concat();
-            request(&all).unwrap().expect_own().is_ok()
+            request(&all).unwrap().expect_own(false).is_ok()
         };
         for path in ["/events", "/user/me/proxy/1/events"] {
             for lines in [
@@ -319,6 +320,8 @@ mod tests {
             }
             for lines in [
                 &["Origin: http://evil.example"][..],
+                &["Origin: http://localhost:1", "Origin: http://evil.example"],
+                &["Sec-Fetch-Site: none", "Sec-Fetch-Site: cross-site"],
                 &["Origin: null"],
                 &["Origin: http://localhost:2"],
                 &["Sec-Fetch-Site: cross-site", "Sec-Fetch-Dest: empty"],
@@ -335,7 +338,7 @@ mod tests {
     fn only_the_page_itself_may_send_something() {
         let allowed = |lines: &[&str]| {
             let all = [&["POST /controls HTTP/1.1", "Host: localhost:1"], lines].concat();
-            request(&all).unwrap().expect_own().is_ok()
+            request(&all).unwrap().expect_own(false).is_ok()
         };
         let json = "Content-Type: application/json";
         assert!(allowed(&[json, "Origin: http://localhost:1"]));

@@ -189,13 +189,13 @@ impl Server {
         let _ = match (&*request.method, &*request.name, &self.on_post) {
             ("GET", "", _) => answer(stream, "200 OK", "text/html", &self.page),
             ("GET", "events", _) => {
-                request.expect_own()?;
+                request.expect_own(!self.token.is_empty())?;
                 let permit = self.take_permit(&self.readers, MOST_READERS);
                 let _permit = permit.ok_or((CROWDED, "There are too many viewers."))?;
                 self.send_events(stream)
             }
             ("POST", "controls", Some(on_post)) => {
-                request.expect_own()?;
+                request.expect_own(!self.token.is_empty())?;
                 on_post(&request.body).map_err(|sentence| ("400 Bad Request", sentence))?;
                 stream.write_all(head("204 No Content", &[]).as_bytes())
             }

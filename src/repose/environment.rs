@@ -248,7 +248,9 @@ impl Env for Repose {
                 self.sim.qvel_mut()[joint.dof] = noise;
             }
         }
-        self.sim.follow();
+        if !self.sim.follow() {
+            self.sim.qpos_mut().copy_from_slice(&hand.start);
+        }
         for (axis, start) in config.goal_position.value.into_iter().enumerate() {
             let noise = self.noise(config.reset_position_noise);
             self.sim.qpos_mut()[hand.object.qpos + axis] = start + noise;

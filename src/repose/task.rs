@@ -59,10 +59,7 @@ impl Task {
     pub fn with_files(all: &Config, known: &Arc<SceneFiles>) -> Result<Arc<Self>> {
         let file = all.env.model_file();
         let mut config = all.env.clone();
-        let plain = Compilation {
-            files: known.or_read(file)?,
-            ..Compilation::plain(config.sim_dt, config.cone)
-        };
+        let plain = Compilation::plain(config.sim_dt, config.cone).in_memory(file, known)?;
         let as_it_is = Scene::load(file, &plain)?;
         let mut parts = Hand::find(&as_it_is, &all.hand).with_context(|| origin(file))?;
         let compilation = Compilation {

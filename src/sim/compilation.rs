@@ -20,6 +20,7 @@ use mujoco_rs::wrappers::mj_editing::{MjsBody, MjsGeom};
 use serde::{Deserialize, Serialize};
 
 use super::constants::*;
+use super::fatal::quieten_mujoco;
 use super::files::{SceneFiles, scene_files};
 use super::placing::{frames_within, geoms_within};
 use crate::quat;
@@ -79,6 +80,29 @@ impl Compilation {
         }
     }
 
+    /// The same compilation of a user's scene in memory: of `known` files if they are those of this scene, and otherwise of its files
+    /// as they are now. If MuJoCo makes something else of the files in memory, where it finds them by the last parts of their names as
+    /// well, the scene stays on the disk.
+    ///
+    /// # Errors
+    /// Fails as [`scene_files`] does.
+    pub fn in_memory(self, file: Option<&Path>, known: &Arc<SceneFiles>) -> Result<Self> {
+        let Some(scene) = file else { return Ok(self) };
+        let of = |files| Self {
+            files,
+            ..self.clone()
+        };
+        if known.hold(scene) {
+            return Ok(of(known.clone()));
+        }
+        let in_memory = of(Arc::new(SceneFiles::read(scene)?));
+        let [there, here] = [&self, &in_memory].map(|own| own.compile(file).ok());
+        let is_same = there
+            .zip(here)
+            .is_some_and(|(there, here)| bytes(&there) == bytes(&here));
+        Ok(if is_same { in_memory } else { self })
+    }
+
     /// Whether it keeps all of a scene but its options.
     pub fn keeps_all(&self) -> bool {
         self.size == 1.0 && !self.shifts && self.adds_goal.is_none()
@@ -90,6 +114,7 @@ impl Compilation {
     /// Fails with MuJoCo's own message if MuJoCo refuses the scene, or if the object cannot be resized. Fails if a name is not UTF-8,
     /// or if the scene names a pipe or a device.
     pub(super) fn compile(&self, file: Option<&Path>) -> Result<MjModel> {
+        quieten_mujoco();
         ensure!(
             !file.is_some_and(Path::is_dir),
             "env.model must name a MuJoCo scene, but this is a folder"
@@ -159,6 +184,13 @@ impl Compilation {
         }
         Ok(spec)
     }
+}
+
+/// A compiled scene as a file.
+fn bytes(model: &MjModel) -> Option<Vec<u8>> {
+    let mut bytes = vec![0; model.size()];
+    model.save_to_buffer(&mut bytes).ok()?;
+    Some(bytes)
 }
 
 /// MuJoCo's whole message about a file that it cannot parse. The wrapper's message has at most 99 bytes.

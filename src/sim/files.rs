@@ -4,7 +4,6 @@ use std::collections::BTreeSet;
 use std::ffi::OsString;
 use std::os::unix::ffi::OsStringExt;
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
 
 use anyhow::{Result, ensure};
 use mujoco_rs::wrappers::mj_auxiliary::MjVfs;
@@ -21,22 +20,14 @@ use crate::os::read_bytes;
 pub struct SceneFiles(pub Vec<(String, Vec<u8>)>);
 
 impl SceneFiles {
-    /// These files if they are those of `scene`, and otherwise its files as they are now.
+    /// The files of this scene as they are now.
     ///
     /// # Errors
     /// Fails as [`scene_files`] does.
-    pub fn or_read(self: &Arc<Self>, scene: Option<&Path>) -> Result<Arc<Self>> {
-        let Some(scene) = scene else {
-            return Ok(Arc::default());
-        };
-        if self.hold(scene) {
-            return Ok(self.clone());
-        }
+    pub fn read(scene: &Path) -> Result<Self> {
         let read = |path: PathBuf| Some((path.to_str()?.to_owned(), read_bytes(&path).ok()?));
-        let mut known = BTreeSet::new();
-        let files = scene_files(scene)?.into_iter();
-        let each = files.filter(|path| known.insert(path.clone()));
-        Ok(Arc::new(Self(each.filter_map(read).collect())))
+        let files = scene_files(scene)?.into_iter().filter_map(read);
+        Ok(Self(files.collect()))
     }
 
     /// Whether they are the files of this scene.
@@ -57,7 +48,7 @@ impl SceneFiles {
 }
 
 /// The most folders of meshes and pictures in which a file is looked for. MuJoCo uses the last ones that a scene names.
-const MOST_FOLDERS: usize = 32;
+const MOST_FOLDERS: usize = 256;
 
 /// The files and folders that a scene may read: its own file, included ones, models, meshes, textures, height fields. Each is
 /// looked for wherever MuJoCo may look for it, so some may not belong to the scene. The bytes of meshes and textures are not read.

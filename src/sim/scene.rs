@@ -9,7 +9,6 @@ use mujoco_rs::prelude::{MjModel, MjtDisableBit, MjtObjBase};
 use super::Look;
 use super::compilation::{Compilation, Cone, origin};
 use super::constants::*;
-use super::fatal::quieten_mujoco;
 use super::finite::not_finite;
 use super::furnish::furnished;
 use crate::os::shortened;
@@ -89,7 +88,6 @@ impl Scene {
     /// # Errors
     /// Fails with the file's name and MuJoCo's own message if MuJoCo refuses the scene.
     pub fn load(file: Option<&Path>, compilation: &Compilation) -> Result<Self> {
-        quieten_mujoco();
         let compiled = compilation.compile(file).and_then(|model| {
             // The built-in scene is known to be finite.
             if file.is_some()

@@ -106,23 +106,33 @@ impl Simulation {
         self.data.qvel_mut()
     }
 
-    /// Moves each joint that follows another by an equality constraint to where the constraint wants it.
-    /// [`Simulation::refresh`] must follow.
-    pub fn follow(&mut self) {
+    /// Moves each joint that follows another by an equality constraint to where the constraint wants it. Returns whether all these
+    /// constraints hold then. [`Simulation::refresh`] must follow.
+    pub fn follow(&mut self) -> bool {
+        let model = self.data.model().clone();
+        let is_tie = |&i: &usize| model.eq_type()[i] == mjEQ_JOINT && model.eq_active0()[i];
+        let ties: Vec<usize> = (0..model.neq() as usize).filter(is_tie).collect();
+        let from_reference = |qpos: &[f64], joint: i32| {
+            let place = *model.jnt_qposadr().get(joint as usize)? as usize;
+            Some(qpos[place] - model.qpos0()[place])
+        };
         // A joint may follow one that follows.
-        for _ in 0..self.data.model().neq() {
-            self.refresh();
-            for row in 0..self.data.ne() as usize {
-                let model = self.data.model();
-                let tie = self.data.efc_id()[row] as usize;
-                if model.eq_type()[tie] == mjEQ_JOINT {
-                    let joint = model.eq_obj1id()[tie] as usize;
-                    let qpos = model.jnt_qposadr()[joint] as usize;
-                    let apart = self.data.efc_pos()[row];
-                    self.qpos_mut()[qpos] -= apart;
-                }
+        (0..=ties.len()).any(|_| {
+            let mut apart: f64 = 0.0;
+            for &tie in &ties {
+                let qpos = self.qpos_mut();
+                // Without a second joint, the first is held where it is.
+                let other = from_reference(qpos, model.eq_obj2id()[tie]).unwrap_or(0.0);
+                let wanted = model.eq_data()[tie][..5]
+                    .iter()
+                    .rfold(0.0, |sum, factor| sum * other + factor);
+                let own = model.jnt_qposadr()[model.eq_obj1id()[tie] as usize] as usize;
+                let wanted = model.qpos0()[own] + wanted;
+                apart = apart.max((qpos[own] - wanted).abs());
+                qpos[own] = wanted;
             }
-        }
+            apart < 1e-9
+        })
     }
 
     /// The controls, in the model's order.

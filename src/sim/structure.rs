@@ -167,7 +167,8 @@ impl Scene {
                 _ => None,
             }
         };
-        (0..model.neq() as usize).filter_map(ends)
+        let is_active = |&i: &usize| model.eq_active0()[i];
+        (0..model.neq() as usize).filter(is_active).filter_map(ends)
     }
 
     /// Whether a joint is part of a loop that such a constraint closes: it moves one end without the other.

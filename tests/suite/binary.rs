@@ -314,7 +314,8 @@ fn the_trace_holds_whole_episodes_in_order_until_there_are_enough_records() {
     let expected = "sim_dt ctrl_dt act_moving_average success_tolerance max_consecutive_successes max_episode_steps model goal_position \
                     friction_scale cube_mass_scale checkpoint observation joint_names actuator_names fingertip_names \
                     quaternion_order vel_obs_scale mirror_matrix hand_mass_scale cube_size_scale gains_scale damping_scale \
-                    frictionloss_scale cube_com gravity cone action_delay prediction predicted_with noise bias actor seed settings";
+                    frictionloss_scale cube_com gravity cone action_delay prediction predicted_with noise bias actor seed settings \
+                    warnings";
     let mut expected: Vec<&str> = expected.split_whitespace().collect();
     header.sort_unstable();
     expected.sort_unstable();

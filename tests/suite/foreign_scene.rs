@@ -219,3 +219,32 @@ fn the_fingerprint_sees_servos_pairs_and_limits_and_that_of_the_builtin_scene_st
     assert_eq!(with(".1", false), with(".2", false));
     assert_ne!(with(".1", true), with(".2", true));
 }
+
+#[test]
+fn a_file_of_the_same_name_elsewhere_does_not_serve_in_place_of_one_that_a_scene_names() {
+    let folder = tempfile::tempdir().unwrap();
+    let folder = folder.path();
+    let corners = |size: f64| {
+        format!(
+            "v 0 0 0\nv {size} 0 0\nv 0 {size} 0\nv 0 0 {size}\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
+        )
+    };
+    fs::write(folder.join("x.obj"), corners(1.0)).unwrap();
+    let path = folder.join("s.xml");
+    let model = format!("env.model={}", path.display());
+    let weighed = |mesh: &str| {
+        let asset = format!("<asset><mesh name=\"m\" file=\"{mesh}\"/>");
+        let body = "<worldbody><body pos=\"9 9 9\"><geom type=\"mesh\" mesh=\"m\"/></body>";
+        fs::write(&path, edited(&[("<asset>", &asset), ("<worldbody>", body)])).unwrap();
+        anyhow::Ok(Task::new(&config(&[&model]))?.scene.fingerprint())
+    };
+    let refused = format!("{:#}", weighed("own/x.obj").unwrap_err());
+    assert!(refused.contains("own/x.obj"), "{refused}");
+    fs::create_dir(folder.join("own")).unwrap();
+    for name in ["own/x.obj", "own/y.obj"] {
+        fs::write(folder.join(name), corners(2.0)).unwrap();
+    }
+    let expected = weighed("own/y.obj").unwrap();
+    assert_ne!(weighed("x.obj").unwrap(), expected);
+    assert_eq!(weighed("own/x.obj").unwrap(), expected);
+}

@@ -391,6 +391,37 @@ fn joints_that_follow_others_start_where_constraints_want_them_and_joints_in_loo
 }
 
 #[test]
+fn joints_that_follow_each_other_hold_all_constraints_or_start_without_noise() {
+    let tie = |one: &str, other: &str, factor: f64| {
+        format!("<joint joint1=\"{one}\" joint2=\"{other}\" polycoef=\"0 {factor} 0 0 0\"/>")
+    };
+    let start = |ties: &[String]| {
+        let more = format!("<equality>{}</equality><tendon>", ties.concat());
+        let (_folder, model) = placed(&THREE_FINGERS.replace("<tendon>", &more));
+        let task = task(&[&model]);
+        let mut env = Repose::new(&task);
+        let mut observation = vec![0.0; task.spaces().observation_size];
+        env.reset(rng::stream(7, "test", 3), &mut observation);
+        (env.sim.qpos()[..9].to_vec(), task.hand.start[..9].to_vec())
+    };
+    let [a, b, c] = ["β bend", "β tip", "γ bend"];
+    for ties in [
+        &[tie(a, b, 1.0), tie(a, b, 1.0)][..],
+        &[tie(a, b, 1.0), tie(b, a, 1.0)],
+        &[tie(a, b, 1.0), tie(a, c, 1.0), tie(b, c, 1.0)],
+    ] {
+        let (found, pose) = start(ties);
+        assert!(
+            (found[4] - found[5]).abs() < 1e-12 && found != pose,
+            "{found:?}"
+        );
+    }
+    // No angles but zero satisfy both.
+    let (found, pose) = start(&[tie(a, b, 2.0), tie(b, a, 2.0)]);
+    assert_eq!(found, pose);
+}
+
+#[test]
 fn a_fingertip_is_a_part_of_the_hand() {
     let marked = THREE_FINGERS.replace("<freejoint/>", "<freejoint/><site name=\"on the block\"/>");
     let marked = marked.replace(
