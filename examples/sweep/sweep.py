@@ -344,7 +344,7 @@ def work(sweep, at_work):
             child = at_work.pop(run)
             if child.returncode != 0:
                 run.fail(f"exit code {child.returncode}, {run.beside('log')} ends with:\n{run.last_words()}")
-            elif run.position() == run.resumed:
+            elif not run.checkpoints() or run.position() == run.resumed:
                 run.fail(f"it made no step, {run.beside('log')} ends with:\n{run.last_words()}")
             elif log := run.log():
                 sweep.expect_columns(log)

@@ -77,7 +77,9 @@ pub fn steps(text: &str) -> Result<u64, String> {
 
 pub fn time(text: &str) -> Result<Duration, String> {
     // Slurm writes days before a hyphen: 1-12:00:00.
-    let span = text.replacen('-', "d ", 1).parse::<jiff::Span>().ok();
+    let days = text.split_once('-').filter(|(_, rest)| rest.contains(':'));
+    let text = days.map_or(text.into(), |(days, rest)| format!("{days}d {rest}"));
+    let span = text.parse::<jiff::Span>().ok();
     let time = span
         .and_then(|span| {
             span.to_duration(jiff::SpanRelativeTo::days_are_24_hours())

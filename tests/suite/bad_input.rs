@@ -429,6 +429,7 @@ fn usage_errors_exit_with_2() {
         &["train", "--keep", "0"],
         &["train", "--stop-after", "soon"],
         &["train", "--stop-after", "0s"],
+        &["train", "--stop-after", "3-4h"],
         &["train", "--name", "a", "--run-dir", "b"],
         &["play", "--out", "x.pdf"],
         &[

@@ -153,6 +153,29 @@ fn a_variant_that_fails_is_named_and_the_others_are_trained() {
 }
 
 #[test]
+fn a_program_that_trains_nothing_is_not_started_again() {
+    if !has_python() {
+        return;
+    }
+    let folder = tempfile::tempdir().unwrap();
+    fs::write(
+        folder.path().join("what.toml"),
+        "steps = 256\nseeds = [0]\n",
+    )
+    .unwrap();
+    let output = sweep(folder.path())
+        .args(["--program", "/bin/true"])
+        .output()
+        .unwrap();
+    let said = String::from_utf8_lossy(&output.stdout);
+    assert_eq!(output.status.code(), Some(1), "{said}");
+    assert!(
+        said.contains("base, seed 0 failed, it made no step"),
+        "{said}"
+    );
+}
+
+#[test]
 fn whatever_is_wrong_in_the_file_of_a_sweep_is_told_in_a_line() {
     if !has_python() {
         return;
