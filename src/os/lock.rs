@@ -10,7 +10,7 @@ use std::fs::{self, File, OpenOptions, TryLockError};
 use std::io::{self, Read};
 use std::os::unix::fs::{FileExt, MetadataExt};
 use std::path::{Path, PathBuf};
-use std::sync::{Arc, LazyLock};
+use std::sync::{Arc, LazyLock, Mutex, MutexGuard, PoisonError};
 use std::thread;
 use std::time::{Duration, Instant, SystemTime};
 
@@ -48,8 +48,8 @@ const PAUSE: Duration = Duration::from_millis(20);
 pub struct Locked {
     path: PathBuf,
     file: File,
-    /// Without locks: as long as this lives, so does the heartbeat.
-    heart: Option<Arc<()>>,
+    /// It replaces the lock where there are no locks.
+    heart: Option<Arc<Heart>>,
 }
 
 impl Locked {
@@ -78,7 +78,7 @@ impl Locked {
                 Err(TryLockError::WouldBlock) if pauses.next().is_some() => thread::sleep(PAUSE),
                 Err(TryLockError::WouldBlock) => bail!(in_use(folder, &path)),
                 // Some network file systems do not support locks.
-                Err(TryLockError::Error(_)) => break Some(beat_in(folder, &path)?),
+                Err(TryLockError::Error(_)) => break Some(Heart::start(folder, &path)?),
             }
         };
         Ok(Self { path, file, heart })
@@ -97,19 +97,20 @@ impl Locked {
             fs::rename(&own.path, &self.path).cannot("write", &self.path)?;
             self.file = file;
         }
-        let said = if self.heart.is_some() {
-            beat(0)
-        } else {
-            name()
-        };
-        nicety(write(&self.file, &said));
+        match &self.heart {
+            Some(heart) => {
+                heart.beat(0);
+            }
+            None => {
+                nicety(write(&self.file, &name()));
+            }
+        }
         Ok(self)
     }
 
     /// Releases the lock and removes the name of this program, after a training run that ended normally.
     pub fn release(self) {
-        // The file may belong to another program by now.
-        if !taken(&self.path) {
+        if self.heart.as_ref().is_none_or(|heart| heart.stop()) {
             nicety(self.file.set_len(0));
         }
     }
@@ -123,9 +124,12 @@ impl Locked {
     pub fn watch(&self) -> impl Fn() -> bool + Send + use<> {
         let path = self.path.clone();
         let file = self.file.try_clone();
+        let heart = self.heart.clone();
         move || {
-            file.as_ref()
-                .is_ok_and(|file| expect_named(&path, file).is_ok())
+            heart.as_ref().is_none_or(|heart| heart.beats())
+                && file
+                    .as_ref()
+                    .is_ok_and(|file| expect_named(&path, file).is_ok())
         }
     }
 
@@ -136,7 +140,7 @@ impl Locked {
     /// Fails with the name of the other program.
     pub fn expect_own(&self) -> Result<()> {
         ensure!(
-            self.heart.is_none() || !taken(&self.path),
+            self.heart.as_ref().is_none_or(|heart| heart.beats()),
             in_use(self.path.parent().unwrap_or(&self.path), &self.path)
         );
         Ok(())
@@ -146,55 +150,102 @@ impl Locked {
 impl Drop for Locked {
     fn drop(&mut self) {
         // The name stays, as in a file that was locked. Without a heartbeat, the next training need not wait.
-        if self.heart.is_some() && !taken(&self.path) {
+        if self.heart.as_ref().is_some_and(|heart| heart.stop()) {
             nicety(write(&self.file, &name()));
         }
     }
 }
 
-/// Writes this program's name and a heartbeat into the lock file from now on, as long as the result lives.
-///
-/// # Errors
-/// Fails if the heart of another program beats in the file, or if it cannot be written to.
-fn beat_in(folder: &Path, path: &Path) -> Result<Arc<()>> {
-    let found = content(path);
-    let watching = Instant::now();
-    while has_beat(&found) && taken(path) && watching.elapsed() < WATCHED {
-        thread::sleep(BEAT / 4);
-        ensure!(
-            content(path) == found,
-            "{}; there are no file locks here, but {LOCK} changes",
-            in_use(folder, path)
-        );
-    }
-    let beat_at = |path: &Path, number| {
-        let opened = File::options().write(true).open(path);
-        opened.and_then(|file| write(&file, &beat(number)))
-    };
-    beat_at(path, 0).cannot("write", path)?;
-    thread::sleep(SETTLED);
-    ensure!(!taken(path), in_use(folder, path));
-    say!(
-        "note: there are no file locks in {}; a heartbeat in {LOCK} replaces them",
-        shown(folder).display()
-    );
-    let file = path.to_owned();
-    let lives = Arc::new(());
-    let alive = Arc::downgrade(&lives);
-    let keep_beating = move || {
-        for number in 1.. {
-            thread::sleep(BEAT);
-            // The folder may belong to another program by now.
-            if alive.strong_count() == 0 || taken(&file) {
-                return;
-            }
-            nicety(beat_at(&file, number));
+/// The heartbeat of a training run where there are no locks.
+#[derive(Debug)]
+struct Heart {
+    /// The lock file.
+    path: PathBuf,
+    /// The time of the last heartbeat, until the heart stops.
+    last: Mutex<Option<Instant>>,
+}
+
+impl Heart {
+    /// Writes this program's name and a heartbeat into the lock file from now on, until the heart stops.
+    ///
+    /// # Errors
+    /// Fails if the heart of another program beats in the file, or if it cannot be written to.
+    fn start(folder: &Path, path: &Path) -> Result<Arc<Self>> {
+        let found = content(path);
+        let watching = Instant::now();
+        while has_beat(&found) && !found.starts_with(&name()) && watching.elapsed() < WATCHED {
+            thread::sleep(BEAT / 4);
+            ensure!(
+                content(path) == found,
+                "{}; there are no file locks here, but {LOCK} changes",
+                in_use(folder, path)
+            );
         }
-    };
-    thread::Builder::new()
-        .spawn(keep_beating)
-        .context("cannot start a thread for the lock")?;
-    Ok(lives)
+        write_at(path, &beat(0)).cannot("write", path)?;
+        thread::sleep(SETTLED);
+        ensure!(!is_anothers(&content(path)), in_use(folder, path));
+        say!(
+            "note: there are no file locks in {}; a heartbeat in {LOCK} replaces them",
+            shown(folder).display()
+        );
+        let heart = Arc::new(Self {
+            path: path.to_owned(),
+            last: Mutex::new(Some(Instant::now())),
+        });
+        let beating = heart.clone();
+        let keep_beating = move || {
+            let mut number = 0;
+            while beating.beat(number) {
+                thread::sleep(BEAT);
+                number += 1;
+            }
+        };
+        thread::Builder::new()
+            .spawn(keep_beating)
+            .context("cannot start a thread for the lock")?;
+        Ok(heart)
+    }
+
+    /// Whether the lock file still belongs to this program. It is lost for ever if it has the name of another program. It is
+    /// also lost without this program's name after a pause in which another program may have come and gone.
+    fn beats(&self) -> bool {
+        self.look().is_some()
+    }
+
+    /// The time of the last heartbeat, if the lock file still belongs to this program.
+    fn look(&self) -> MutexGuard<'_, Option<Instant>> {
+        let mut last = self.last.lock().unwrap_or_else(PoisonError::into_inner);
+        let lost = |time: Instant, content: String| {
+            if time.elapsed() > WATCHED / 2 {
+                !content.starts_with(&name())
+            } else {
+                is_anothers(&content)
+            }
+        };
+        // Nothing is known about a file that cannot be read now.
+        let content = read(&self.path).ok();
+        if last
+            .zip(content)
+            .is_some_and(|(time, content)| lost(time, content))
+        {
+            *last = None;
+        }
+        last
+    }
+
+    /// Writes a heartbeat. Returns whether the lock file still belongs to this program.
+    fn beat(&self, number: u64) -> bool {
+        let mut last = self.look();
+        if last.is_some() && write_at(&self.path, &beat(number)).is_ok() {
+            *last = Some(Instant::now());
+        }
+        last.is_some()
+    }
+
+    /// Stops. Returns whether the lock file belonged to this program until now.
+    fn stop(&self) -> bool {
+        self.look().take().is_some()
+    }
 }
 
 /// What the lock file contains at this heartbeat.
@@ -213,10 +264,16 @@ fn write(file: &File, content: &str) -> io::Result<()> {
     file.set_len(content.len() as u64)
 }
 
-/// Whether a lock file has the name of another program. One that is gone, empty or cannot be read just now has none.
-fn taken(path: &Path) -> bool {
-    let content = content(path);
-    !content.is_empty() && !content.starts_with(&name())
+/// Replaces the content of the lock file at this path.
+fn write_at(path: &Path, content: &str) -> io::Result<()> {
+    let opened = File::options().write(true).open(path);
+    opened.and_then(|file| write(&file, content))
+}
+
+/// Whether this content of a lock file has the whole name of another program. Damaged content is nobody's.
+fn is_anothers(content: &str) -> bool {
+    let number = content.lines().nth(1);
+    number.is_some_and(|line| line.starts_with("number ")) && !content.starts_with(&name())
 }
 
 /// What the lock file of a run folder shows to a reader.
@@ -273,10 +330,15 @@ fn holder(path: &Path) -> String {
 
 /// The content of a lock file, or nothing if it cannot be read.
 fn content(path: &Path) -> String {
-    let mut content = String::new();
-    let read = File::open(path).and_then(|file| file.take(LONGEST).read_to_string(&mut content));
-    nicety(read);
-    content
+    read(path).unwrap_or_default()
+}
+
+/// Reads a lock file. Only files are opened: opening a pipe would wait.
+fn read(path: &Path) -> io::Result<String> {
+    if !fs::metadata(path)?.is_file() {
+        return Err(io::ErrorKind::InvalidInput.into());
+    }
+    io::read_to_string(File::open(path)?.take(LONGEST))
 }
 
 /// What this program signs lock files with: a line that names it, and a number that no other process of this name has, e.g. in
@@ -345,7 +407,7 @@ mod tests {
     fn beating(folder: &Path) -> Result<Locked> {
         let path = folder.join(LOCK);
         let open = OpenOptions::new().read(true).write(true).open(&path);
-        let heart = Some(beat_in(folder, &path)?);
+        let heart = Some(Heart::start(folder, &path)?);
         let file = open.unwrap();
         Locked { path, file, heart }.sign()
     }
@@ -357,19 +419,45 @@ mod tests {
         fs::write(&path, "").unwrap();
         fs::hard_link(&path, place.path().join("copy")).unwrap();
         let lock = beating(place.path()).unwrap();
-        assert!(has_beat(&content(&path)) && !taken(&path));
+        assert!(content(&path).starts_with(&name()) && has_beat(&content(&path)));
         drop(lock);
         assert_eq!(content(&path), name(), "it has failed");
         let begun = Instant::now();
         let lock = beating(place.path()).unwrap();
         assert!(begun.elapsed() < WATCHED, "the next one need not wait");
-        fs::write(&path, ": process 1 on another").unwrap();
+        fs::write(&path, ANOTHERS).unwrap();
         assert!(
-            !lock.holds() && lock.expect_own().is_err(),
+            !lock.holds() && !lock.watch()() && lock.expect_own().is_err(),
             "it looks again"
         );
         drop(lock);
-        assert_eq!(holder(&path), ": process 1 on another");
+        assert_eq!(content(&path), ANOTHERS);
+    }
+
+    const ANOTHERS: &str = ": process 1 on another\nnumber 7";
+
+    #[test]
+    fn where_there_are_no_locks_a_folder_is_lost_while_its_training_is_suspended() {
+        let place = tempfile::tempdir().unwrap();
+        let path = place.path().join(LOCK);
+        // The other program goes on, has ended, or has failed.
+        for left in [&format!("{ANOTHERS}\nheartbeat 3"), "", ANOTHERS] {
+            fs::write(&path, "").unwrap();
+            let lock = beating(place.path()).unwrap();
+            let heart = lock.heart.as_ref().unwrap();
+            {
+                let mut last = heart.last.lock().unwrap();
+                *last = last.map(|time| time.checked_sub(WATCHED).unwrap());
+                fs::write(&path, left).unwrap();
+            }
+            thread::sleep(2 * BEAT);
+            assert!(!lock.holds() && !lock.watch()(), "{left}");
+            fs::write(&path, beat(9)).unwrap();
+            assert!(lock.expect_own().is_err(), "lost for ever");
+            fs::write(&path, left).unwrap();
+            lock.release();
+            assert_eq!(content(&path), left);
+        }
     }
 
     #[test]
@@ -405,10 +493,13 @@ mod tests {
         let path = place.path().join(LOCK);
         fs::write(&path, "").unwrap();
         let lock = beating(place.path()).unwrap();
-        fs::write(&path, "").unwrap();
-        assert!(lock.holds());
-        thread::sleep(2 * BEAT);
-        assert!(has_beat(&content(&path)), "the heart goes on");
+        let [short, zeros] = [&name()[..9], &"\0".repeat(60)];
+        for damaged in ["", short, zeros, "number 7"] {
+            fs::write(&path, damaged).unwrap();
+            assert!(lock.holds(), "{damaged}");
+            thread::sleep(2 * BEAT);
+            assert!(has_beat(&content(&path)), "the heart goes on");
+        }
         fs::remove_file(&path).unwrap();
         assert!(lock.expect_own().is_ok() && !lock.holds());
         fs::write(&path, "").unwrap();

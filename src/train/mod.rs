@@ -361,7 +361,6 @@ mod tests {
             &session,
             RunFolder::create(Some(place.path()), None).unwrap(),
         );
-        let latest = saver.held.folder.checkpoints.latest();
         let mut lead = Lead::new(&session, saver, true);
         lead.open_folder().unwrap();
         let never = Requests::none();
@@ -375,6 +374,7 @@ mod tests {
         let error = session.iterate(&never, &mut lead).unwrap_err();
         let error = format!("{:#}", lead.end(&session, Err(error)).unwrap_err());
         assert!(error.contains("iteration 2: panic: "), "{error}");
+        let latest = place.path().join("checkpoints/latest.safetensors");
         let saved = os::read_bytes(&latest).unwrap();
         assert_eq!(Checkpoint::parse(&saved).unwrap().progress.iteration, 1);
     }

@@ -102,9 +102,8 @@ impl Saver {
         self.save_before_fatal_errors();
     }
 
-    /// Writes into the folder for the first time, unless that is done. The order is the checkpoint that the training run starts
-    /// from (as the newest), the logs (cut off after it), and the settings. So a run that is killed in between can be
-    /// resumed, and no row is cut off where nothing can be written.
+    /// Writes into the folder for the first time, unless that is done. If that fails, there is nothing to save but the state that the
+    /// training run starts from, which leaves a resumed run as it was.
     ///
     /// # Errors
     /// Fails if the folder cannot be written to.
@@ -112,6 +111,20 @@ impl Saver {
         if self.held.wrote {
             return Ok(());
         }
+        let begun = self.begin(report);
+        if begun.is_err() {
+            self.held.last = self.initial.clone();
+            self.held.best = None;
+            self.held.best_is_saved = true;
+        }
+        self.save_before_fatal_errors();
+        begun
+    }
+
+    /// Writes what a run begins with. The order is the checkpoint that the training run starts from (as the newest), the settings,
+    /// and the logs (cut off after it). So a run that is killed in between can be resumed, and no row is cut off where nothing can be
+    /// written.
+    fn begin(&mut self, report: &mut Report) -> Result<()> {
         self.own_folder(report)?;
         let lock = self.lock.take().map(|lock| self.held.folder.claim(lock));
         self.lock = lock.transpose()?;
@@ -125,6 +138,7 @@ impl Saver {
             ));
         }
         write(&self.held.folder, None, &self.initial, self.held.keep)?;
+        self.describe()?;
         let Progress {
             iteration,
             env_steps,
@@ -135,10 +149,8 @@ impl Saver {
             fork.as_ref().map_or(0, |fork| fork.iteration)..*iteration,
             *env_steps,
         );
-        self.describe()?;
         self.held.folder.mark_finished(false);
         self.held.wrote = true;
-        self.save_before_fatal_errors();
         Ok(())
     }
 
@@ -156,6 +168,7 @@ impl Saver {
     /// # Errors
     /// Fails if another training run uses it, or if something else lies where it was deleted.
     fn own_folder(&mut self, report: &mut Report) -> Result<()> {
+        self.expect_own()?;
         let folder = &mut self.held.folder;
         if !self.lock.as_ref().is_some_and(Locked::holds) {
             let lock = folder.lock()?;
@@ -201,8 +214,6 @@ impl Saver {
     /// # Errors
     /// Fails if the folder cannot be written to.
     pub fn save(&mut self, report: &mut Report) -> Result<()> {
-        // What could not be done after the first iteration comes first now.
-        self.open_folder(report)?;
         self.own_folder(report)?;
         report.sync();
         self.describe()?;

@@ -147,8 +147,11 @@ fn a_run_that_is_resumed_is_left_as_it_was_until_an_iteration_is_done() {
 fn a_run_that_is_resumed_where_nothing_can_be_saved_is_left_as_it_was() {
     let place = tempfile::tempdir().unwrap();
     let folder = place.path();
-    let refusing = "#include <errno.h>\n\
-        int rename(const char *a, const char *b) { (void)a; (void)b; errno = EIO; return -1; }\n";
+    // Refuses to rename a file, always or once.
+    let refusing = "#define _GNU_SOURCE\n#include <dlfcn.h>\n#include <errno.h>\n#include <stdlib.h>\n#include <string.h>\n\
+        static int refused;\nint rename(const char *a, const char *b) {\n\
+        if (!strcmp(getenv(\"REFUSED\"), \"always\") || !refused++) { errno = EIO; return -1; }\n\
+        return ((int (*)(const char *, const char *))dlsym(RTLD_NEXT, \"rename\"))(a, b); }\n";
     let Some(library) = preloaded(folder, refusing) else {
         return;
     };
@@ -162,18 +165,21 @@ fn a_run_that_is_resumed_where_nothing_can_be_saved_is_left_as_it_was() {
         files
     };
     let before = of_run();
-    let mut resumed = command(
-        folder,
-        &["train", "--resume", "run", "--total-steps", "1024"],
-    );
-    let output = resumed.env("LD_PRELOAD", library).output().unwrap();
-    assert_eq!(output.status.code(), Some(1));
-    assert!(
-        stderr(&output).contains("cannot write run/"),
-        "{}",
-        stderr(&output)
-    );
-    assert!(of_run() == before);
+    for refused in ["always", "once"] {
+        let mut resumed = command(
+            folder,
+            &["train", "--resume", "run", "--total-steps", "1024"],
+        );
+        resumed.env("LD_PRELOAD", &library).env("REFUSED", refused);
+        let output = resumed.output().unwrap();
+        assert_eq!(output.status.code(), Some(1));
+        let said = stderr(&output);
+        assert!(
+            said.contains("cannot write run/") && said.contains("the run folder was not changed"),
+            "{said}"
+        );
+        assert!(of_run() == before, "{refused}: {said}");
+    }
 }
 
 #[test]

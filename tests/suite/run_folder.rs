@@ -311,28 +311,48 @@ fn a_training_that_was_suspended_where_there_are_no_locks_looks_again_before_it_
         command
     };
     let args = train(&["--total-steps", "100000000", "--run-dir", "run"]);
-    let (first, first_lines) = begun(run(&args));
-    send("STOP", &first);
-    let (second, second_lines) = begun(run(&["train", "--resume", "run"]));
-    send("CONT", &first);
-    let said: Vec<String> = first_lines.map_while(|line| line.ok()).collect();
-    let said = said.join("\n");
-    assert!(
-        said.contains("is in use by another program") && said.contains("instead; resume with"),
-        "{said}"
-    );
-    let mut first = first;
-    assert_eq!(first.wait().unwrap().code(), Some(1));
-    assert_eq!(ended_by("TERM", second, second_lines).0, Some(143));
-    let iterations: Vec<String> = metrics(&folder.path().join("run"))
-        .into_iter()
-        .map(|row| row[0].clone())
-        .collect();
-    let expected = (1..iterations.len()).map(|number| number.to_string());
-    assert!(
-        iterations[1..].iter().cloned().eq(expected),
-        "{iterations:?}"
-    );
+    let place = folder.path().join("run");
+    // The second training has ended, was killed, or lives when the first one wakes up.
+    for (signal, code) in [
+        (Some("TERM"), Some(143)),
+        (Some("KILL"), None),
+        (None, Some(143)),
+    ] {
+        let begin = if place.exists() {
+            &["train", "--resume", "run"][..]
+        } else {
+            &args
+        };
+        let (mut first, first_lines) = begun(run(begin));
+        send("STOP", &first);
+        let (second, second_lines) = begun(run(&["train", "--resume", "run"]));
+        let second = match signal {
+            Some(signal) => {
+                assert_eq!(ended_by(signal, second, second_lines).0, code);
+                None
+            }
+            None => Some((second, second_lines)),
+        };
+        let left = everything(&place);
+        send("CONT", &first);
+        let said: Vec<String> = first_lines.map_while(|line| line.ok()).collect();
+        let said = said.join("\n");
+        assert!(
+            said.contains("is in use by another program") && said.contains("instead; resume with"),
+            "{signal:?}: {said}"
+        );
+        assert_eq!(first.wait().unwrap().code(), Some(1));
+        match second {
+            Some((second, lines)) => assert_eq!(ended_by("TERM", second, lines).0, code),
+            None => assert!(everything(&place) == left, "{signal:?}"),
+        }
+        let numbers: Vec<String> = metrics(&place)
+            .into_iter()
+            .map(|row| row[0].clone())
+            .collect();
+        let expected = (1..numbers.len()).map(|number| number.to_string());
+        assert!(numbers[1..].iter().cloned().eq(expected), "{numbers:?}");
+    }
 }
 
 #[test]
