@@ -208,22 +208,18 @@ fn learner(task: &Arc<Task>, config: &Config) -> Result<Found> {
     let samples = size as f64 / median(seconds);
     let gflops = 1e-9 * flops * samples;
     let matmul = median(matmul_gflops(ppo, size, REPEATS));
-    let mut lines = format!(
+    let lines = format!(
         "learner                   {samples:>10.0} samples/s {gflops:.1} GFLOP/s\n\
-         its matrix products alone                      {matmul:.1} GFLOP/s\n"
+         its matrix products alone                      {matmul:.1} GFLOP/s\n\
+         its threads wait          {:>10.1} % of the time\n",
+        100.0 * waiting
     );
-    let mut figures = vec![
+    let figures = vec![
         ("learner_samples_per_s", samples),
         ("learner_gflops", gflops),
         ("matmul_gflops", matmul),
+        ("learner_waits", waiting),
     ];
-    if let Some(waiting) = waiting {
-        lines += &format!(
-            "its threads wait          {:>10.1} % of the time\n",
-            100.0 * waiting
-        );
-        figures.push(("learner_waits", waiting));
-    }
     Ok((figures, lines))
 }
 

@@ -1,7 +1,14 @@
 //! Signals and the time limit, which request the program to save and stop, or to save and continue. A second request to stop, or
 //! one while there is nothing to save, ends the program at once.
 
+#![expect(
+    unsafe_code,
+    reason = "only the C library reports what a signal does without changing it"
+)]
+
+use std::mem::MaybeUninit;
 use std::process::ExitCode;
+use std::ptr::null;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicI32, Ordering};
 use std::thread;
@@ -12,7 +19,6 @@ use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM, SIGUSR1, SIGXFSZ};
 use signal_hook::iterator::Signals;
 use signal_hook::low_level::{emulate_default_handler, exit};
 
-use super::machine::process_status;
 use super::output::remove_unfinished;
 use super::pip;
 use super::stderr::drain;
@@ -62,12 +68,10 @@ impl Requests {
     /// Fails if the system refuses a handler or a thread.
     pub fn listen(saves: bool) -> Result<Self> {
         let requests = Self::none();
-        // The bits of the signals that were ignored when the program started.
-        let ignored = u64::from_str_radix(&process_status("SigIgn:"), 16).unwrap_or(0);
         let caught = [SIGINT, SIGTERM, SIGHUP]
             .into_iter()
             .chain(saves.then_some(SIGUSR1));
-        let caught = caught.filter(|signal| ignored >> (signal - 1) & 1 == 0);
+        let caught = caught.filter(|signal| !is_ignored(*signal));
         signal_hook::flag::register(SIGXFSZ, Arc::default()).context("cannot catch signals")?;
         let mut signals = Signals::new(caught).context("cannot catch signals")?;
         let shared = requests.clone();
@@ -138,6 +142,16 @@ impl Requests {
     /// Whether a save was requested since the last call.
     pub fn take_save(&self) -> bool {
         self.save.swap(false, Ordering::Relaxed)
+    }
+}
+
+/// Whether this signal is ignored, e.g. SIGHUP under `nohup`.
+fn is_ignored(signal: i32) -> bool {
+    let mut action = MaybeUninit::<libc::sigaction>::uninit();
+    // SAFETY: without a new action nothing changes, and the old one is read only if it was written.
+    unsafe {
+        libc::sigaction(signal, null(), action.as_mut_ptr()) == 0
+            && action.assume_init().sa_sigaction == libc::SIG_IGN
     }
 }
 

@@ -430,12 +430,13 @@ mod tests {
             .finish(b"gone")
             .unwrap();
         assert!(!fs::metadata("/dev/null").unwrap().is_file());
-        assert!(
-            OutputFile::create(Path::new("/dev/full"))
-                .unwrap()
-                .finish(b"no room")
-                .is_err()
-        );
+        let full = Path::new("/dev/full");
+        if !full.exists() {
+            eprintln!("not tested: a full device, which only Linux has");
+            return;
+        }
+        let device = OutputFile::create(full).unwrap();
+        assert!(device.finish(b"no room").is_err());
     }
 
     #[test]

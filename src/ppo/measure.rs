@@ -17,7 +17,7 @@ const LIMIT: f64 = 5.0;
 
 /// Times up to `repeats` gradient steps (gathering, forward, backward and Adam, both nets) on a minibatch of a
 /// collected rollout. The results are the time of each, s, and the share of the time of all threads in which they neither compute nor
-/// look for work, if the system reports it.
+/// look for work.
 ///
 /// # Errors
 /// Fails if a loss or gradient is not finite.
@@ -25,7 +25,7 @@ pub fn time_gradient_steps(
     ppo: &mut Ppo,
     rollout: &mut Rollout,
     repeats: usize,
-) -> Result<(Vec<f64>, Option<f64>)> {
+) -> Result<(Vec<f64>, f64)> {
     ppo.prepare(rollout);
     ppo.backend.begin(&ppo.policy, rollout);
     // Samples from the whole rollout, as in a shuffled minibatch.
@@ -48,14 +48,9 @@ pub fn time_gradient_steps(
         all += taken;
         seconds.push(taken);
     }
-    let worked = os::processor_seconds()
-        .zip(before)
-        .map(|(after, before)| after - before);
+    let worked = os::processor_seconds() - before;
     let of_threads = all * rayon::current_num_threads() as f64;
-    Ok((
-        seconds,
-        worked.map(|worked| (1.0 - worked / of_threads).max(0.0)),
-    ))
+    Ok((seconds, (1.0 - worked / of_threads).max(0.0)))
 }
 
 /// The matrix products of one forward and backward pass: sizes of weights `[outputs, inputs]`, and whether the

@@ -853,27 +853,33 @@ fn bench_prints_every_figure() {
 
 #[cfg(all(target_os = "linux", target_arch = "x86_64"))]
 #[test]
-fn a_processor_without_avx_is_named_in_a_sentence() {
-    let of_2008 = [
-        "-cpu",
-        "Nehalem",
-        env!("CARGO_BIN_EXE_shadow-repose"),
-        "--version",
-    ];
-    match std::process::Command::new("qemu-x86_64")
-        .args(of_2008)
-        .output()
-    {
-        Err(_) => assert!(!must_be_possible(
+fn a_processor_without_avx_is_named_in_a_sentence_and_avx_is_enough() {
+    let emulated = |processor: &str, args: &[&str]| {
+        let mut qemu = std::process::Command::new("qemu-x86_64");
+        let program = env!("CARGO_BIN_EXE_shadow-repose");
+        qemu.args(["-cpu", processor, program]).args(args).output()
+    };
+    let Ok(of_2008) = emulated("Nehalem", &["--version"]) else {
+        assert!(!must_be_possible(
             "no qemu-x86_64, which emulates other processors"
-        )),
-        Ok(output) => {
-            assert_eq!(output.status.code(), Some(1), "{}", stderr(&output));
-            assert!(
-                stderr(&output).starts_with("error: this processor has no AVX"),
-                "{}",
-                stderr(&output)
-            );
-        }
-    }
+        ));
+        return;
+    };
+    assert_eq!(of_2008.status.code(), Some(1), "{}", stderr(&of_2008));
+    assert!(
+        stderr(&of_2008).starts_with("error: this processor has no AVX"),
+        "{}",
+        stderr(&of_2008)
+    );
+    let short = [
+        "play",
+        "--ckpt=builtin",
+        "--headless",
+        "--episodes=1",
+        "--threads=1",
+        "--set=env.max_episode_seconds=1",
+    ];
+    let of_2011 = succeeded(emulated("SandyBridge", &short).unwrap());
+    let said = String::from_utf8(of_2011.stdout).unwrap();
+    assert!(said.contains("goals per episode"), "{said}");
 }

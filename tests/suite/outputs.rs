@@ -9,7 +9,8 @@ use std::process::{Command, Output, Stdio};
 use std::time::{Duration, Instant};
 
 use crate::support::{
-    SCENE, command, must_be_possible, names, obeying_signals, program, stderr, succeeded, train,
+    SCENE, command, has, must_be_possible, names, obeying_signals, program, stderr, succeeded,
+    train,
 };
 
 /// The arguments for very short episodes.
@@ -53,7 +54,7 @@ fn what_a_link_leads_to_is_written_and_the_link_stays() {
     );
     // A link to stdout, as /dev/stdout is: it gets the trace, then the table.
     let to_stdout = folder.join("stdout");
-    std::os::unix::fs::symlink("/proc/self/fd/1", &to_stdout).unwrap();
+    std::os::unix::fs::symlink("/dev/fd/1", &to_stdout).unwrap();
     let args = [&SHORT[..], &["--episodes", "1", "--out", "jsonl:stdout"]].concat();
     succeeded(shell(folder, "", &args, "> both"));
     let both = fs::read_to_string(folder.join("both")).unwrap();
@@ -85,13 +86,15 @@ fn a_result_that_cannot_be_printed_is_an_error() {
         &["--help"],
         &["--version"],
     ] {
-        let output = shell(folder, "", args, "> /dev/full");
-        assert_eq!(output.status.code(), Some(1), "{args:?}");
-        assert!(
-            stderr(&output).contains("cannot write to stdout"),
-            "{args:?}: {}",
-            stderr(&output)
-        );
+        if has("/dev/full") {
+            let output = shell(folder, "", args, "> /dev/full");
+            assert_eq!(output.status.code(), Some(1), "{args:?}");
+            assert!(
+                stderr(&output).contains("cannot write to stdout"),
+                "{args:?}: {}",
+                stderr(&output)
+            );
+        }
         // A reader that closes the pipe is no error.
         let output = shell(folder, "{ ", args, "; echo $? > code; } | true");
         assert!(stderr(&output).is_empty(), "{args:?}: {}", stderr(&output));

@@ -26,7 +26,7 @@ fn set_mode(path: &Path, mode: u32) {
 #[track_caller]
 fn refused_to_a_user(folder: &Path, args: &[&str], reason: &str) {
     let mut command = command(folder, args);
-    if fs::metadata("/proc/self").unwrap().uid() == 0 {
+    if fs::metadata(folder).unwrap().uid() == 0 {
         command.uid(NOBODY).gid(NOBODY);
     }
     match command.output() {

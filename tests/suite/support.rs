@@ -72,10 +72,12 @@ pub(crate) fn program(folder: &Path, args: &[&str]) -> Output {
 pub(crate) fn obeying_signals() {
     static ONCE: Once = Once::new();
     let ignored = |signal: i32| {
-        let status = fs::read_to_string("/proc/self/status").unwrap();
+        // Other systems than Linux do not tell.
+        let status = fs::read_to_string("/proc/self/status").unwrap_or_default();
         let mut lines = status.lines();
-        let mask = lines.find_map(|line| line.strip_prefix("SigIgn:")).unwrap();
-        u64::from_str_radix(mask.trim(), 16).unwrap() >> (signal - 1) & 1 == 1
+        let mask = lines.find_map(|line| line.strip_prefix("SigIgn:"));
+        let mask = mask.map_or(0, |mask| u64::from_str_radix(mask.trim(), 16).unwrap());
+        mask >> (signal - 1) & 1 == 1
     };
     ONCE.call_once(|| {
         for signal in [SIGHUP, SIGINT, SIGQUIT, SIGTERM, SIGUSR1] {
@@ -101,8 +103,12 @@ pub(crate) fn command(folder: &Path, args: &[&str]) -> Command {
     command
 }
 
-/// Compiles a library from this C code, for `LD_PRELOAD`. It stands for a system that behaves so. Returns `None` without a compiler.
+/// Compiles a library from this C code, for `LD_PRELOAD`. It stands for a system that behaves so. Returns `None` without a compiler for
+/// the programs that run here, or without such a variable.
 pub(crate) fn preloaded(folder: &Path, code: &str) -> Option<String> {
+    if !has("/proc/self/fd") || is_emulated() {
+        return None;
+    }
     let (source, library) = (folder.join("preloaded.c"), folder.join("preloaded.so"));
     fs::write(&source, code).unwrap();
     let compiled = Command::new("cc")
@@ -151,6 +157,20 @@ pub(crate) fn must_be_possible(what: &str) -> bool {
     );
     eprintln!("not tested: {what}");
     false
+}
+
+/// Whether this system has a file that Linux has. If not, prints that something cannot be tested here.
+pub(crate) fn has(file: &str) -> bool {
+    Path::new(file).exists() || must_be_possible(&format!("{file}, which Linux has"))
+}
+
+/// Whether another kind of processor is emulated here. Then prints that something cannot be tested here.
+pub(crate) fn is_emulated() -> bool {
+    let is_emulated = std::env::var_os("QEMU_LD_PREFIX").is_some();
+    if is_emulated {
+        eprintln!("not tested: what needs a compiler or a system of the emulated processor");
+    }
+    is_emulated
 }
 
 /// Returns how many of the cube's colours (red, orange, yellow, green, blue) cover more than 0.2 % each of a picture
