@@ -67,11 +67,6 @@ const PLATFORMS: [Platform; 4] = [
 ];
 
 fn main() {
-    println!("cargo::rerun-if-changed=build.rs");
-    println!("cargo::rerun-if-changed=src/os/pip.rs");
-    println!("cargo::rerun-if-env-changed=MUJOCO_DYNAMIC_LINK_DIR");
-    println!("cargo::rerun-if-env-changed=MUJOCO_STATIC_LINK_DIR");
-    println!("cargo::rerun-if-env-changed=SHADOW_REPOSE_PACKAGE");
     let target = [
         variable("CARGO_CFG_TARGET_OS"),
         variable("CARGO_CFG_TARGET_ARCH"),
@@ -81,6 +76,11 @@ fn main() {
             "shadow-repose does not build for Windows itself; build it there in WSL2, as for Linux",
         );
     }
+    println!("cargo::rerun-if-changed=build.rs");
+    println!("cargo::rerun-if-changed=src/os/pip.rs");
+    println!("cargo::rerun-if-env-changed=MUJOCO_DYNAMIC_LINK_DIR");
+    println!("cargo::rerun-if-env-changed=MUJOCO_STATIC_LINK_DIR");
+    println!("cargo::rerun-if-env-changed=SHADOW_REPOSE_PACKAGE");
     version_facts();
     if env::var_os("DOCS_RS").is_some() || env::var_os("MUJOCO_STATIC_LINK_DIR").is_some() {
         return;

@@ -61,8 +61,9 @@ def main():
         if not own:
             without.append(f"{name} {version} ({licence})")
     print("Rust's standard library: MIT OR Apache-2.0 https://github.com/rust-lang/rust")
-    print("LLVM's libc++, libc++abi and libunwind: Apache-2.0 WITH LLVM-exception https://llvm.org")
-    print("MuJoCo, lib/libmuj-sr.so.*, its library under a name of our own: Apache-2.0 https://github.com/google-deepmind/mujoco\n")
+    if "linux" in target:
+        print("LLVM's libc++, libc++abi and libunwind: Apache-2.0 WITH LLVM-exception https://llvm.org")
+    print("MuJoCo, lib/libmuj-sr.*, its library under a name of our own: Apache-2.0 https://github.com/google-deepmind/mujoco\n")
     print("No licence text comes with the source of these; the texts of their licences are among those below:")
     print("  " + ", ".join(without))
     for title, text in of_mujoco().items():

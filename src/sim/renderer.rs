@@ -10,9 +10,14 @@ use super::graphics::{attempt, described};
 use super::{Scene, Simulation};
 
 /// The advice printed if there is no renderer.
-const HELP: &str = "
+const HELP: &str = if cfg!(target_os = "macos") {
+    "
+  macOS draws one picture or film in a process, and only on its main thread: use `play --out FILE.mp4` or `view --out FILE.png`."
+} else {
+    "
   Pictures are drawn with EGL, which needs neither a display nor a graphics card.
-  On Debian and Ubuntu: apt install libegl1 libgl1-mesa-dri";
+  On Debian and Ubuntu: apt install libegl1 libgl1-mesa-dri"
+};
 
 /// A renderer for simulations of one scene. It belongs to the thread that created it.
 pub struct Renderer {

@@ -11,9 +11,14 @@ use super::panel::{CloseLeftPanel, Panel};
 use super::{Controls, Readout, Scene, Simulation};
 
 /// The advice printed if no window can be opened.
-const HELP: &str = "
+const HELP: &str = if cfg!(target_os = "macos") {
+    "
+  A window needs a desktop with OpenGL. Over ssh, use `play --web`."
+} else {
+    "
   A window needs a display (DISPLAY or WAYLAND_DISPLAY) with OpenGL.
-  On Debian and Ubuntu: apt install libgl1 libxcursor1 libxi6 libx11-xcb1 libxkbcommon-x11-0";
+  On Debian and Ubuntu: apt install libgl1 libxcursor1 libxi6 libx11-xcb1 libxkbcommon-x11-0"
+};
 
 /// An open window.
 pub struct Viewer {

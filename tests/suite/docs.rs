@@ -2,6 +2,7 @@
 
 use crate::support::task;
 use std::fs;
+use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 
 use shadow_repose::repose::{ACTUATORS, FINGERTIPS, Group, JOINTS};
@@ -341,4 +342,50 @@ fn evaluations(path: &str) -> Vec<[f64; 3]> {
             ])
         })
         .collect()
+}
+
+#[test]
+fn every_command_of_the_workflows_exists_and_packages_are_made_for_every_platform() {
+    // What the forge's runners have beside this checkout.
+    const INSTALLED: [&str; 5] = ["cargo", "cd", "sha256sum", "gh", "rm"];
+    let mut commands = 0;
+    for name in ["ci", "release"] {
+        let text = read(&format!(".github/workflows/{name}.yml"));
+        let run = text
+            .lines()
+            .filter_map(|line| line.trim_start().strip_prefix("- run: "));
+        for command in run.flat_map(|line| line.split(" && ")) {
+            commands += 1;
+            let program = command.split_whitespace().next().unwrap();
+            if INSTALLED.contains(&program) {
+                continue;
+            }
+            let mode = fs::metadata(root().join(program)).map(|facts| facts.permissions().mode());
+            assert!(
+                mode.is_ok_and(|mode| mode & 0o111 != 0),
+                "{name}: {command}"
+            );
+        }
+    }
+    assert_eq!(commands, 11);
+    let release = read(".github/workflows/release.yml");
+    let platforms = read("build.rs").matches("target: [\"").count();
+    let is_known =
+        |system, arch| read("build.rs").contains(&format!("target: [\"{system}\", \"{arch}\"]"));
+    let targets: Vec<&str> = release
+        .lines()
+        .filter_map(|line| line.split_once("target: ")?.1.strip_suffix(" }"))
+        .collect();
+    assert_eq!(targets.len(), platforms);
+    for target in targets {
+        let system = if target.ends_with("-apple-darwin") {
+            "macos"
+        } else {
+            "linux"
+        };
+        assert!(
+            is_known(system, target.split('-').next().unwrap()),
+            "{target}"
+        );
+    }
 }

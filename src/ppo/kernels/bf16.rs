@@ -29,6 +29,7 @@ pub fn rounded(x: f32) -> f32 {
 }
 
 /// Rows and columns of a product that are computed together: two by two tiles.
+#[cfg(target_arch = "x86_64")]
 pub const BLOCK: usize = 2 * LINES;
 
 /// A unit of the processor that multiplies bf16 matrices. A value proves that the unit is there and may be used.
@@ -51,6 +52,7 @@ pub trait Unit: Sync {
 ///
 /// # Panics
 /// Panics if the sizes do not match.
+#[cfg(target_arch = "x86_64")]
 pub fn in_blocks<F>(
     out: &mut [f32],
     columns: usize,
