@@ -47,7 +47,10 @@ def _binding() -> int:
 
     All its symbols are bound at once, so a later library changes nothing. Only where another MuJoCo offers its symbols to all libraries,
     ours come first. The module would then also take `free` from the C library, which must not free what another allocator has allocated.
+    On macOS, a library names the library of each symbol that it uses.
     """
+    if sys.platform != "linux":
+        return os.RTLD_NOW
     import ctypes
 
     everything = ctypes.CDLL(None)
