@@ -15,7 +15,7 @@ use rayon::prelude::*;
 
 use crate::env::{End, Env};
 use crate::os::Bar;
-use crate::ppo::{FrozenPolicy, GROUP, Policy, Workspace};
+use crate::ppo::{FrozenPolicy, GROUP, Policy};
 use crate::ranks::Exchange;
 use crate::repose::{EpisodeStats, Repose, Score, Task};
 use crate::rng::{self, Rng};
@@ -255,8 +255,7 @@ struct Lanes<'a> {
     observations: Vec<f32>,
     /// `[LANES, A]`
     actions: Vec<f32>,
-    work: Option<Workspace>,
-    spaces: Spaces,
+
     /// The number of the first episode.
     first: usize,
     /// The number of episodes, which the last group may have fewer of than lanes.
@@ -271,8 +270,6 @@ impl<'a> Lanes<'a> {
             lanes: lanes.map(|_| Lane::new(trial.task)).collect(),
             observations: vec![0.0; LANES * spaces.observation_size],
             actions: vec![0.0; LANES * spaces.action_size],
-            work: trial.actor.policy().map(|policy| policy.workspace(LANES)),
-            spaces,
             first: 0,
             count: 0,
         }
@@ -286,7 +283,7 @@ impl<'a> Lanes<'a> {
             .lanes
             .len()
             .min(episodes.first + episodes.count - first);
-        let size = self.spaces.observation_size;
+        let size = self.trial.task.spaces().observation_size;
         let rows = self.observations.par_chunks_exact_mut(size);
         self.lanes[..self.count]
             .par_iter_mut()
@@ -316,7 +313,6 @@ impl<'a> Lanes<'a> {
             lanes,
             observations,
             actions,
-            work,
             first,
             ..
         } = self;
@@ -324,18 +320,8 @@ impl<'a> Lanes<'a> {
             observation_size,
             action_size,
             ..
-        } = self.spaces;
-        trial
-            .actor
-            .choose(observations, lanes, actions, work.as_mut());
-        let mut running = lanes
-            .iter()
-            .zip(actions.chunks_exact(action_size))
-            .filter(|(lane, _)| lane.running);
-        ensure!(
-            running.all(|(_, action)| action.iter().all(|x| x.is_finite())),
-            NOT_FINITE
-        );
+        } = trial.task.spaces();
+        trial.actor.choose(observations, lanes, actions);
         let acted = lanes
             .par_iter_mut()
             .zip(actions.par_chunks_exact(action_size));
@@ -344,11 +330,11 @@ impl<'a> Lanes<'a> {
             .enumerate();
         rows.filter(|(_, ((lane, _), _))| lane.running)
             .try_for_each(|(i, ((lane, action), row))| {
+                ensure!(action.iter().all(|x| x.is_finite()), NOT_FINITE);
                 let episode = *first + i;
                 let stepped = stepping("episode", episode, || caught(|| lane.step(action, row)));
-                stepped
-                    .map(drop)
-                    .map_err(|panic| anyhow!("episode {episode} panicked: {panic}"))
+                stepped.map_err(|panic| anyhow!("episode {episode} panicked: {panic}"))?;
+                Ok(())
             })?;
         let rows = observations
             .chunks_exact(observation_size)
@@ -400,34 +386,23 @@ impl Actor<'_> {
         }
     }
 
-    fn policy(&self) -> Option<&FrozenPolicy<'_>> {
-        match self {
-            Actor::Mean(policy) | Actor::Stochastic(policy) => Some(policy),
-            _ => None,
-        }
-    }
-
     /// Writes the actions of these lanes, of which there is at least one, one row each. Actions of lanes that have ended are not used.
-    fn choose(
-        &self,
-        observations: &[f32],
-        lanes: &mut [Lane],
-        actions: &mut [f32],
-        work: Option<&mut Workspace>,
-    ) {
-        if let (Some(policy), Some(work)) = (self.policy(), work) {
-            policy.compute(observations, [actions, &mut []], work);
-        }
+    fn choose(&self, observations: &[f32], lanes: &mut [Lane], actions: &mut [f32]) {
         let Spaces {
             observation_size,
             action_size: size,
             ..
         } = lanes[0].env.spaces();
-        if let Actor::Outside(act) = self {
-            act(
+        match self {
+            Actor::Mean(policy) | Actor::Stochastic(policy) => {
+                let mut work = policy.workspace(actions.len() / size);
+                policy.compute(observations, [actions, &mut []], &mut work);
+            }
+            Actor::Outside(act) => act(
                 &observations[..lanes.len() * observation_size],
                 &mut actions[..lanes.len() * size],
-            );
+            ),
+            _ => {}
         }
         for (lane, row) in lanes.iter_mut().zip(actions.chunks_exact_mut(size)) {
             match self {
@@ -458,8 +433,6 @@ pub struct Player {
     pub lane: Lane,
     observation: Vec<f32>,
     action: Vec<f32>,
-    /// The policy's workspace, from the first step of an episode on.
-    work: Option<Workspace>,
 }
 
 impl Player {
@@ -470,13 +443,10 @@ impl Player {
             action_size,
             ..
         } = task.spaces();
-        let observation = vec![0.0; observation_size];
-        let action = vec![0.0; action_size];
         let mut player = Self {
             lane: Lane::new(task),
-            observation,
-            action,
-            work: None,
+            observation: vec![0.0; observation_size],
+            action: vec![0.0; action_size],
         };
         player.start(episodes, episodes.first);
         player
@@ -485,28 +455,17 @@ impl Player {
     /// Starts the episode with the given number.
     pub fn start(&mut self, episodes: Episodes, episode: usize) {
         self.lane.start(episodes, episode, &mut self.observation);
-        self.work = None;
     }
 
-    /// Takes one step with the action of `actor`, and returns the end of the episode if the step ended it. The sizes of its
-    /// policy must be the same throughout an episode.
+    /// Takes one step with the action of `actor`, and returns the end of the episode if the step ended it.
     pub fn step(&mut self, actor: &Actor) -> Option<End> {
         self.step_changed(actor, |_| {})
     }
 
     /// Takes one step with the action of `actor` after a change to it.
     pub fn step_changed(&mut self, actor: &Actor, change: impl FnOnce(&mut [f32])) -> Option<End> {
-        self.work = self
-            .work
-            .take()
-            .or_else(|| actor.policy().map(|policy| policy.workspace(1)));
         let lane = std::slice::from_mut(&mut self.lane);
-        actor.choose(
-            &self.observation,
-            lane,
-            &mut self.action,
-            self.work.as_mut(),
-        );
+        actor.choose(&self.observation, lane, &mut self.action);
         change(&mut self.action);
         self.lane.step(&self.action, &mut self.observation)
     }
@@ -539,7 +498,7 @@ mod tests {
             }
             let ppo = Ppo::new(&config.ppo, spaces, 0, Exchange::alone(1)).unwrap();
             let actor = Actor::Mean(ppo.policy.freeze());
-            let mut work = actor.policy().map(|policy| policy.workspace(2));
+
             // Cube and goal coincide: once unrotated, once both rotated by half a turn about their own x axis.
             let Spaces {
                 observation_size: size,
@@ -557,7 +516,7 @@ mod tests {
             }
             let (mut lanes, mut actions) =
                 ([Lane::new(&task), Lane::new(&task)], vec![0.0; 2 * 20]);
-            actor.choose(&observations, &mut lanes, &mut actions, work.as_mut());
+            actor.choose(&observations, &mut lanes, &mut actions);
             let (one, other) = actions.split_at(20);
             assert_eq!(one == other, alike);
         }

@@ -268,12 +268,10 @@ fn first_sound(places: &[PathBuf]) -> Result<(PathBuf, Checkpoint)> {
 
 /// Whether the file is not there.
 fn is_absence(error: &Error) -> bool {
-    let kinds = error
+    let mut causes = error
         .chain()
         .filter_map(|cause| cause.downcast_ref::<std::io::Error>());
-    kinds
-        .map(std::io::Error::kind)
-        .any(|kind| kind == std::io::ErrorKind::NotFound)
+    causes.any(|cause| cause.kind() == std::io::ErrorKind::NotFound)
 }
 
 /// Whether the bytes of the file are damaged, as opposed to intact but unusable.
@@ -328,11 +326,7 @@ pub fn for_fork(
         ref fork,
         ..
     } = checkpoint.progress;
-    let made = iteration
-        - fork
-            .as_ref()
-            .map_or(0, |fork| fork.iteration)
-            .min(iteration);
+    let made = iteration.saturating_sub(fork.as_ref().map_or(0, |fork| fork.iteration));
     let mut after = parent.clone();
     if made > parent.ppo.critic_first {
         after.ppo.critic_first = 0;

@@ -43,6 +43,11 @@ pub fn mul<T: Copy + Mul<Output = T> + Add<Output = T> + Sub<Output = T>>(
     ]
 }
 
+/// The quaternion in these values from `at` on.
+pub fn read<T: Copy>(values: &[T], at: usize) -> [T; 4] {
+    *values[at..].first_chunk().expect("a quaternion")
+}
+
 /// The inverse rotation.
 pub fn conj([w, x, y, z]: Quat) -> Quat {
     [w, -x, -y, -z]

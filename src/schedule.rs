@@ -35,21 +35,14 @@ pub fn in_rounds<B: Send>(
     let waiting: Mutex<VecDeque<(&mut B, usize)>> =
         Mutex::new(blocks.iter_mut().map(|block| (block, 0)).collect());
     // The lock is not held during work, so no panic can occur under it.
+    let queue = || waiting.lock().expect("no panic under this lock");
     rayon::broadcast(|_| {
-        loop {
-            let Some((block, round)) = waiting
-                .lock()
-                .expect("no panic under this lock")
-                .pop_front()
-            else {
-                break;
-            };
+        // A closure gives the lock back before the work.
+        let next = || queue().pop_front();
+        while let Some((block, round)) = next() {
             if round < rounds {
                 work(block, round);
-                waiting
-                    .lock()
-                    .expect("no panic under this lock")
-                    .push_back((block, round + 1));
+                queue().push_back((block, round + 1));
             }
         }
     });

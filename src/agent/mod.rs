@@ -89,8 +89,13 @@ impl Agent<Repose> {
             .map(|_| Repose::randomized(task, randomization.as_ref()))
             .collect();
         let settings = config.clone();
-        let lessons = move |env_steps| Lesson::at(env_steps, &settings);
-        Self::new(envs, &config.ppo, config.run.seed, exchange, lessons)
+        Self::new(
+            envs,
+            &config.ppo,
+            config.run.seed,
+            exchange,
+            move |env_steps| Lesson::at(env_steps, &settings),
+        )
     }
 }
 
@@ -249,9 +254,8 @@ impl<E: Resumable> Agent<E> {
         self.ppo
             .begin_after(self.fork.as_ref().map_or(0, |fork| fork.iteration));
         self.ppo.restore(checkpoint)?;
-        let numbers = checkpoint.take_doubles(NUMBERS)?;
         let state = EnvState {
-            numbers,
+            numbers: checkpoint.take_doubles(NUMBERS)?,
             counters: checkpoint.take_counters(COUNTERS)?,
         };
         self.pool
@@ -309,9 +313,8 @@ pub fn expect_states(checkpoint: &Checkpoint, config: &Config) -> Result<()> {
     // An iteration makes at least as many steps as the first one, and at most as many as the last one.
     let least = i128::from(config.steps_per_iteration());
     let most = (config.env.num_envs * config.ppo.horizon_at(u64::MAX)) as i128;
-    let possible = own >= 0 && (own * least..=own * most).contains(&steps) && steps % least == 0;
     ensure!(
-        possible,
+        own >= 0 && (own * least..=own * most).contains(&steps) && steps % least == 0,
         "{iteration} iterations cannot have made {env_steps} steps"
     );
     for name in [NUMBERS, COUNTERS] {

@@ -8,7 +8,8 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use anyhow::{Context, Result};
-use rand_distr::{Distribution, StandardNormal};
+use rand::RngExt;
+use rand_distr::StandardNormal;
 use serde_json::json;
 
 use crate::agent::{Agent, step_block};
@@ -131,13 +132,13 @@ impl Bursts {
             noise,
             std,
         } = self;
-        let actions = rollout
+        for action in rollout
             .blocks
             .iter_mut()
-            .flat_map(|block| &mut block.actions);
-        actions.for_each(|action| {
-            *action = *std * Distribution::<f32>::sample(&StandardNormal, noise)
-        });
+            .flat_map(|block| &mut block.actions)
+        {
+            *action = *std * noise.sample::<f32, _>(StandardNormal);
+        }
         pool.envs_mut().for_each(RecordingEnv::begin);
         let start = Instant::now();
         let stepped = in_rounds(

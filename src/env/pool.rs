@@ -174,15 +174,11 @@ impl<E: Env> EnvPool<E> {
             .into_par_iter()
             .enumerate()
             .with_max_len(MOST_AT_ONCE)
-            .map(|(place, (member, row))| {
-                let episode = member.step(autoreset, row)?;
-                Ok(episode.map(|episode| (place, episode)))
+            .filter_map(|(place, (member, row))| {
+                let ended = member.step(autoreset, row).transpose()?;
+                Some(ended.map(|episode| (place, episode)))
             });
-        Ok(ended
-            .collect::<Result<Vec<_>>>()?
-            .into_iter()
-            .flatten()
-            .collect())
+        ended.collect()
     }
 
     /// Switches all environments to `lesson` from the next step on.
@@ -247,9 +243,7 @@ impl<E: Resumable> EnvPool<E> {
             stepping("environment", number, restore)
                 .with_context(|| format!("environment {number}"))?;
         }
-        self.blocks
-            .iter_mut()
-            .for_each(|block| block.finished.clear());
+        self.take_finished();
         Ok(())
     }
 }

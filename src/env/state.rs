@@ -68,11 +68,7 @@ impl<'a> SavedEnv<'a> {
     /// # Errors
     /// Fails if fewer are left.
     pub fn numbers<const N: usize>(&mut self) -> Result<[f64; N]> {
-        let next = self
-            .numbers
-            .split_off(..N)
-            .and_then(|next| next.first_chunk().copied());
-        next.context("the state has too few numbers")
+        Ok(self.next(N)?.try_into()?)
     }
 
     /// Reads the next `count` numbers.
@@ -99,11 +95,8 @@ impl<'a> SavedEnv<'a> {
     /// # Errors
     /// Fails if fewer are left.
     pub fn counters<const N: usize>(&mut self) -> Result<[u64; N]> {
-        let next = self
-            .counters
-            .split_off(..N)
-            .and_then(|next| next.first_chunk().copied());
-        next.context("the state has too few counters")
+        let next = self.counters.split_off(..N);
+        Ok(next.context("the state has too few counters")?.try_into()?)
     }
 
     /// Checks that everything has been read.

@@ -116,13 +116,12 @@ impl Checkpoint {
     /// Only the parts that playing needs. The path of a fork's checkpoint is left out. The path of an own scene stays in the
     /// settings, where it tells scenes apart.
     pub fn policy_alone(&self) -> Self {
-        let needed = |name: &str| {
+        let mut alone = self.clone();
+        alone.arrays.retain(|name, _| {
             ["actor.", "critic.", "normalizer.", LOG_STD]
                 .iter()
                 .any(|part| name.starts_with(part))
-        };
-        let mut alone = self.clone();
-        alone.arrays.retain(|name, _| needed(name));
+        });
         alone.progress.fork = None;
         alone
     }
@@ -227,18 +226,15 @@ impl Checkpoint {
         let count = self.take_vector("normalizer.count", 1)?[0];
         let mean = self.take_vector("normalizer.mean", size)?;
         let variance = self.take_vector("normalizer.variance", size)?;
-        let sound = mean
-            .iter()
-            .chain(&variance)
-            .chain([&count])
-            .all(|x| x.abs() < 1e18);
         ensure!(
-            sound,
+            mean.iter()
+                .chain(&variance)
+                .chain([&count])
+                .all(|x| x.abs() < 1e18),
             "a tensor `normalizer.…` has a value that no observations can produce"
         );
-        let positive = count >= 0.0 && variance.iter().all(|&v| v >= 0.0);
         ensure!(
-            positive,
+            count >= 0.0 && variance.iter().all(|&v| v >= 0.0),
             "tensor `normalizer.variance` or `normalizer.count` has a negative value"
         );
         policy.normalizer = Normalizer {

@@ -106,8 +106,7 @@ fn seal(mut texts: Texts, views: Vec<(String, TensorView)>) -> Result<Vec<u8>> {
     let mut parsed: serde_json::Map<String, serde_json::Value> = serde_json::from_slice(header)?;
     parsed
         .values_mut()
-        .filter_map(serde_json::Value::as_object_mut)
-        .for_each(serde_json::Map::sort_keys);
+        .for_each(serde_json::Value::sort_all_objects);
     let sorted = serde_json::to_vec(&parsed)?;
     header.fill(b' ');
     header[..sorted.len()].copy_from_slice(&sorted);

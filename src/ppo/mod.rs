@@ -84,10 +84,8 @@ impl Ppo {
         let policy = Policy::random(config, spaces, seed);
         let arithmetic = Arithmetic::new(config.precision)?;
         let backend: Box<dyn GradientBackend> = match config.backend {
-            Backend::Fused => Box::new(Fused::new(config, arithmetic)),
-            Backend::Candle => Box::new(Reference {
-                config: config.clone(),
-            }),
+            Backend::Fused => Box::new(Fused::new(arithmetic)),
+            Backend::Candle => Box::new(Reference),
         };
         let count = policy.layout.count();
         let slices = exchange.slices(norm_chunks(&policy.layout.nets()));

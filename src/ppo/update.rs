@@ -113,9 +113,8 @@ impl Ppo {
                 }
             }
             for View { name, range, .. } in self.policy.layout.views() {
-                let finite = self.policy.parameters[range].iter().all(|x| x.is_finite());
                 ensure!(
-                    finite,
+                    self.policy.parameters[range].iter().all(|x| x.is_finite()),
                     "the update made `{name}` infinite or NaN: the training run has failed and stops here"
                 );
             }
@@ -183,9 +182,14 @@ impl Ppo {
         let nets = self.policy.layout.nets();
         let groups = self.exchange.groups(samples);
         let count = self.exchange.of_all(samples.len());
-        let sums =
-            self.backend
-                .gradients(&self.policy, rollout, &groups, count, &mut self.of_groups)?;
+        let sums = self.backend.gradients(
+            &self.policy,
+            &self.config,
+            rollout,
+            &groups,
+            count,
+            &mut self.of_groups,
+        )?;
         let add_up = |parameters: Range<usize>, out: &mut [f32]| match stage {
             Stage::CriticAlone if parameters.start < nets[0].end => out.fill(0.0),
             _ => tree_sum(out, &self.of_groups, parameters),
@@ -225,11 +229,9 @@ impl Ppo {
 
     /// The mean losses of a minibatch of `count` samples, given the sums of each group on this rank.
     pub fn losses(&self, sums: &[Losses], count: usize) -> Losses {
-        let of_shard =
-            |groups: &[Losses]| groups.iter().copied().reduce(Losses::add).expect("a group");
         let own = sums
             .chunks(sums.len() / self.exchange.own_shards().len())
-            .map(of_shard)
+            .map(|groups| groups.iter().copied().reduce(Losses::add).expect("a group"))
             .collect();
         self.exchange.in_order(own, Losses::add).means(count)
     }

@@ -30,13 +30,14 @@ impl Exchange {
                 .chunks_mut(in_shard)
                 .zip(&mut shuffles)
                 .for_each(|(samples, rng)| samples.shuffle(rng));
-            let window = |part: usize| {
-                order
-                    .chunks(in_shard)
-                    .flat_map(move |shard| &shard[part * of_shard..][..of_shard])
-            };
             (0..in_shard / of_shard)
-                .map(|part| window(part).copied().collect())
+                .map(|part| {
+                    order
+                        .chunks(in_shard)
+                        .flat_map(|shard| &shard[part * of_shard..][..of_shard])
+                        .copied()
+                        .collect()
+                })
                 .collect()
         }
     }

@@ -50,19 +50,15 @@ impl Slices {
         sum: impl Fn(Range<usize>, &mut [f32]) + Sync,
         of: impl Fn(&[f32]) -> f64 + Sync,
     ) -> Vec<f64> {
+        let parts = split(numbers, &self.chunks).into_par_iter();
         if self.exchange.is_alone() {
-            let sum_and_of = |(chunk, out): (Range<usize>, &mut [f32])| {
+            let sum_and_of = |(chunk, out): (_, &mut [f32])| {
                 sum(chunk, out);
                 of(out)
             };
-            return split(numbers, &self.chunks)
-                .into_par_iter()
-                .map(sum_and_of)
-                .collect();
+            return parts.map(sum_and_of).collect();
         }
-        split(numbers, &self.chunks)
-            .into_par_iter()
-            .for_each(|(chunk, out)| sum(chunk, out));
+        parts.for_each(|(chunk, out)| sum(chunk, out));
         let parts = self.exchange.all_to_all(numbers, &self.all);
         // A rank without values has no chunks either, so the length does not matter.
         let parts: Vec<&[f32]> = parts.chunks(self.own.len().max(1)).collect();
@@ -101,13 +97,13 @@ fn split<'a>(
     mut numbers: &'a mut [f32],
     chunks: &[Range<usize>],
 ) -> Vec<(Range<usize>, &'a mut [f32])> {
-    let next = |chunk: &Range<usize>| {
-        (
-            chunk.clone(),
-            numbers.split_off_mut(..chunk.len()).expect("room for all"),
-        )
-    };
-    chunks.iter().map(next).collect()
+    chunks
+        .iter()
+        .map(|chunk| {
+            let own = numbers.split_off_mut(..chunk.len());
+            (chunk.clone(), own.expect("room for all"))
+        })
+        .collect()
 }
 
 #[cfg(test)]

@@ -65,15 +65,6 @@ impl Conditions {
         (task.config.action_delay + self.draw.as_ref().map_or(0, EpisodePhysics::delay)) as usize
     }
 
-    /// The largest delay of any episode.
-    pub fn most_delay(&self, task: &Task) -> u32 {
-        let drawn = self
-            .randomization
-            .as_ref()
-            .map_or(0, |randomization| randomization.config.delay[1]);
-        task.config.action_delay + drawn
-    }
-
     /// Applies the random force on the object that belongs to a step (from 0) of the episode of `rng`, and returns it, N.
     pub fn push(
         &self,
@@ -112,11 +103,8 @@ impl Conditions {
     /// Adds sensor noise for step `steps` and the constant offset of the episode that owns `rng`.
     pub fn disturb(&self, rng: &Rng, steps: u32, task: &Task, observation: &mut [f32]) {
         let drawn = self.randomization.as_ref().zip(self.draw.as_ref());
-        let spreads = [
-            Some(&task.noise),
-            drawn.and_then(|(randomization, draw)| randomization.noise(draw)),
-        ];
-        let noises = spreads
+        let of_draw = drawn.and_then(|(randomization, draw)| randomization.noise(draw));
+        let noises = [Some(&task.noise), of_draw]
             .into_iter()
             .flatten()
             .filter(|spread| !spread.is_empty());

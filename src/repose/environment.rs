@@ -15,12 +15,12 @@ use super::randomization::{EpisodePhysics, Randomization};
 use super::reward::{Step, task_reward};
 use super::servos::Servos;
 use super::task::Task;
-use super::{EpisodeStats, Lesson, StepSums, TaskReward, TrainingReward, add};
+use super::{EpisodeStats, Lesson, StepSums, add};
 use crate::config::SuccessHold;
 use crate::env::{End, Env, EnvState, Resumable, SavedEnv, Transition};
 use crate::quat::{self, Quat};
 use crate::rng::{self, Rng};
-use crate::sim::{Actuator, Pose, Simulation};
+use crate::sim::{Pose, Simulation};
 use crate::spaces::Spaces;
 
 /// One Shadow Hand with its cube.
@@ -57,13 +57,14 @@ impl Repose {
 
     /// Creates an environment of `task` some of whose episodes are randomised.
     pub fn randomized(task: &Arc<Task>, randomization: Option<&Arc<Randomization>>) -> Self {
-        let conditions = Conditions::new(randomization);
-        let memory = conditions.most_delay(task).max(task.config.prediction) as usize;
+        let drawn_delay = randomization.map_or(0, |randomization| randomization.config.delay[1]);
+        let delay = task.config.action_delay + drawn_delay;
+        let memory = delay.max(task.config.prediction) as usize;
         let scene = randomization.map_or(&task.scene, |randomization| &randomization.nominal);
         Self {
             sim: Simulation::new(scene),
             servos: Servos::new(task.hand.actuators.len(), memory),
-            conditions,
+            conditions: Conditions::new(randomization),
             task: task.clone(),
             lesson: Lesson::task(&task.config),
             rng: rng::stream(0, "unused", 0),
@@ -148,8 +149,8 @@ impl Repose {
             self.send();
         }
         self.measure(rot_dist_before);
-        self.last.reward = TaskReward::default();
-        self.last.training = TrainingReward::default();
+        self.last.reward = Default::default();
+        self.last.training = Default::default();
     }
 
     /// Rewards a step that did not diverge, and adds it to the sums.
@@ -193,18 +194,6 @@ impl Repose {
         self.held = 0;
         // The target may affect the physics of a custom scene, so nothing may depend on its old pose.
         self.sim.refresh();
-    }
-
-    fn restore_times(&mut self, [age, held]: [u64; 2]) -> Result<()> {
-        // `age` has no tighter limit: a fork may have shorter episodes.
-        let possible = age <= u64::from(u32::MAX / 2) && held <= age;
-        ensure!(
-            possible,
-            "impossible episode: at step {age} its goal has been held for {held} steps"
-        );
-        self.age = age as u32;
-        self.held = held as u32;
-        Ok(())
     }
 
     /// Decides whether the lesson replaces a goal that was not reached. The decision is random, so the state needs no clock.
@@ -256,18 +245,13 @@ impl Env for Repose {
             self.sim.qpos_mut()[hand.object.qpos + axis] = start + noise;
         }
         let orientation = self.draw_rotation();
-        self.sim.qpos_mut()[hand.object.qpos + 3..hand.object.qpos + 7]
-            .copy_from_slice(&orientation);
+        self.sim.qpos_mut()[hand.object.qpos + 3..][..4].copy_from_slice(&orientation);
         self.replace_goal();
-        let target = |actuator: &Actuator| {
-            self.sim
-                .length(*actuator)
-                .clamp(actuator.range[0], actuator.range[1])
-        };
-        self.servos.reset(
-            hand.actuators.iter().map(target),
-            self.conditions.delay(&self.task),
-        );
+        let targets = hand.actuators.iter().map(|actuator| {
+            let [low, high] = actuator.range;
+            self.sim.length(*actuator).clamp(low, high)
+        });
+        self.servos.reset(targets, self.conditions.delay(&task));
         self.send();
         self.last.action.fill(0.0);
         self.age = 0;
@@ -321,9 +305,8 @@ impl Env for Repose {
             self.replace_goal();
         }
         self.show(observation);
-        let reward = self.lesson.total(self.last.reward, self.last.training);
         Transition {
-            reward: reward as f32,
+            reward: self.lesson.total(self.last.reward, self.last.training) as f32,
             end,
         }
     }
@@ -356,7 +339,14 @@ impl Resumable for Repose {
 
     fn restore(&mut self, state: &mut SavedEnv, observation: &mut [f32]) -> Result<()> {
         self.rng = rng::at(state.counters()?);
-        self.restore_times(state.counters()?)?;
+        let [age, held] = state.counters()?;
+        // `age` has no tighter limit: a fork may have shorter episodes.
+        ensure!(
+            age <= u64::from(u32::MAX / 2) && held <= age,
+            "impossible episode: at step {age} its goal has been held for {held} steps"
+        );
+        self.age = age as u32;
+        self.held = held as u32;
         let [randomized] = state.counters()?;
         ensure!(
             randomized <= 1,
@@ -380,13 +370,9 @@ impl Resumable for Repose {
             .iter_mut()
             .zip(state.next(actuators)?)
             .for_each(|(own, x)| *own = *x as f32);
-        let clipped = self
-            .last
-            .action
-            .iter()
-            .all(|action| (-1.0..=1.0).contains(action));
+        let mut actions = self.last.action.iter();
         ensure!(
-            clipped,
+            actions.all(|action| (-1.0..=1.0).contains(action)),
             "the previous action is outside [-1, 1]: {:?}",
             self.last.action
         );

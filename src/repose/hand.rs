@@ -95,11 +95,9 @@ impl Hand {
             .iter()
             .map(|&actuator| scene.driven(actuator))
             .collect();
-        let refused = driven
-            .iter()
-            .flatten()
-            .filter_map(|(joint, _)| scene.hinge(joint).err());
-        problems.extend(refused.map(|error| error.to_string()));
+        for (joint, _) in driven.iter().flatten() {
+            problems.extend(scene.hinge(joint).err().map(|error| error.to_string()));
+        }
         problems.sort();
         problems.dedup();
         let (Ok(object), Ok(goal), Ok(keyframe), []) = (object, goal, keyframe, &problems[..])

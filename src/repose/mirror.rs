@@ -67,10 +67,8 @@ impl Mirror {
     /// The mirror between hands whose names do not tell that they are on different sides, if the fingertips are in the same places only in
     /// the mirror.
     pub fn by_fingertips(here: &Record, policy: &Record, layout: &Layout) -> Option<Self> {
-        let is_near =
-            |(a, b): (&[f64; 7], &[f64; 7])| (0..3).all(|i| (a[i] - b[i]).abs() <= TOLERANCE);
-        let is_same = here.tips.iter().zip(&policy.tips).all(is_near);
-        if is_same {
+        let mut tips = here.tips.iter().zip(&policy.tips);
+        if tips.all(|(a, b)| (0..3).all(|i| (a[i] - b[i]).abs() <= TOLERANCE)) {
             None
         } else {
             Self::new(here, policy, layout).ok()
@@ -83,8 +81,7 @@ impl Mirror {
             .iter()
             .for_each(|&i| observation[i] = -observation[i]);
         for &(at, turn) in &self.tips {
-            let own: [f32; 4] = *observation[at..].first_chunk().expect("an orientation");
-            let turned = quat::mul(own, turn.map(|x| x as f32));
+            let turned = quat::mul(quat::read(observation, at), turn.map(|x| x as f32));
             observation[at..at + 4].copy_from_slice(&turned);
         }
     }

@@ -64,32 +64,21 @@ impl Randomization {
         } else {
             task.scene.clone()
         };
-        let mut sizes = sizes(config.cube_size);
-        sizes.push(1.0);
-        let scene = |size| {
-            Ok((
-                size,
-                if size == 1.0 {
-                    nominal.clone()
-                } else {
-                    task.scene_with(size, shifts)?
-                },
-            ))
-        };
-        let scenes = sizes
-            .into_iter()
-            .map(scene)
-            .collect::<Result<Vec<_>>>()
-            .context("randomization.cube_size")?;
-        let alike = scenes
-            .iter()
-            .all(|(_, scene)| scene.has_structure_of(&nominal));
-        let file = || origin(task.config.model_file());
-        ensure!(
-            alike,
-            "{}: its structure changes with the size of the object",
-            file()
-        );
+        let mut scenes = vec![(1.0, nominal.clone())];
+        for size in sizes(config.cube_size) {
+            if size == 1.0 {
+                continue;
+            }
+            let scene = task
+                .scene_with(size, shifts)
+                .context("randomization.cube_size")?;
+            ensure!(
+                scene.has_structure_of(&nominal),
+                "{}: its structure changes with the size of the object",
+                origin(task.config.model_file())
+            );
+            scenes.push((size, scene));
+        }
         Ok(Some(Arc::new(Self {
             config: config.clone(),
             nominal,

@@ -10,7 +10,7 @@ use super::observation::Layout;
 use crate::config::Symmetry;
 use crate::os::shortened;
 use crate::quat::CUBE_ROTATIONS;
-use crate::sim::{Frame, Parts, Pose, Scene, Simulation};
+use crate::sim::{Parts, Scene, Simulation};
 use crate::spaces::Spaces;
 
 /// The most bytes of a record that are read. The record of the Shadow Hand has three thousand.
@@ -140,11 +140,10 @@ impl Record {
                 differ.push(format!("{} {what}s, not {}", found.len(), own.len()));
                 continue;
             }
-            for (own, found) in own
-                .iter()
-                .zip(found)
-                .filter(|(own, found)| !is_named(found, own))
-            {
+            for (own, found) in own.iter().zip(found) {
+                if is_named(found, own) {
+                    continue;
+                }
                 if is_other_side(found, own) {
                     is_other_hand = true;
                 } else {
@@ -211,12 +210,12 @@ fn tips_at(hand: &Hand, scene: &Scene, fractions: &[f64]) -> Vec<[f64; 7]> {
         sim.qpos_mut()[joint.qpos] = joint.range[0] + fraction * (joint.range[1] - joint.range[0]);
     }
     sim.refresh();
-    let pose = |tip: &Frame| {
-        let Pose {
-            position: [x, y, z],
-            orientation: [qw, qx, qy, qz],
-        } = sim.pose(*tip);
-        [x, y, z, qw, qx, qy, qz]
-    };
-    hand.fingertips.iter().map(pose).collect()
+    let poses = hand.fingertips.iter().map(|&tip| sim.pose(tip));
+    poses
+        .map(|pose| {
+            let [x, y, z] = pose.position;
+            let [qw, qx, qy, qz] = pose.orientation;
+            [x, y, z, qw, qx, qy, qz]
+        })
+        .collect()
 }

@@ -133,12 +133,7 @@ pub fn task_reward(env: &EnvConfig, step: &Step) -> TaskReward {
 
 /// The reward that training adds to a step, given the weights of its terms.
 pub fn training_reward(weights: &TrainingReward, step: &Step) -> TrainingReward {
-    let mut values = *weights;
-    values
-        .iter_mut()
-        .zip(&TRAINING)
-        .for_each(|(weight, TrainingTerm(.., value))| *weight *= value(step));
-    values
+    std::array::from_fn(|i| weights[i] * (TRAINING[i].2)(step))
 }
 
 /// The weights of the terms that training adds, after `env_steps` control steps of the whole run.

@@ -81,22 +81,21 @@ pub fn combine(bias: &mut Vec<(usize, f32)>, more: impl Iterator<Item = (usize, 
 /// numbers. It stays the same however the body turns.
 pub fn offset(observation: &mut [f32], bias: &[(usize, f32)], layout: &Layout) {
     let orientations = || {
-        std::iter::once(layout.start(OBJECT_QUAT)).chain(layout.tips().map(|tip| tip + TIP_QUAT))
+        let tips = layout.tips().map(|tip| tip + TIP_QUAT);
+        tips.chain([layout.start(OBJECT_QUAT)])
     };
     let of_value = |i: usize| {
         bias.binary_search_by_key(&i, |&(i, _)| i)
             .map_or(0.0, |at| bias[at].1)
     };
-    let in_orientation = |i: usize| orientations().any(|at| (at..at + 4).contains(&i));
-    bias.iter()
-        .filter(|(i, _)| !in_orientation(*i))
-        .for_each(|&(i, added)| observation[i] += added);
+    for &(i, added) in bias {
+        if !orientations().any(|at| (at..at + 4).contains(&i)) {
+            observation[i] += added;
+        }
+    }
     for at in orientations() {
-        let q = [0, 1, 2, 3].map(|i| observation[at + i]);
-        let turned = quat::mul(
-            q,
-            [1.0, of_value(at + 1), of_value(at + 2), of_value(at + 3)],
-        );
+        let error = [1.0, of_value(at + 1), of_value(at + 2), of_value(at + 3)];
+        let turned = quat::mul(quat::read(observation, at), error);
         observation[at..at + 4].copy_from_slice(&turned);
     }
 }
@@ -105,7 +104,7 @@ pub fn offset(observation: &mut [f32], bias: &[(usize, f32)], layout: &Layout) {
 /// orientation relative to the goal follows from the orientation of the object.
 pub fn make_consistent(observation: &mut [f32], layout: &Layout) {
     let read = |observation: &[f32], at: usize| {
-        let q = [0, 1, 2, 3].map(|i| f64::from(observation[at + i]));
+        let q = quat::read(observation, at).map(f64::from);
         let length = quat::length(&q);
         // Noise this close to the negative of a quaternion leaves no orientation.
         if length > 1e-6 {
@@ -115,10 +114,7 @@ pub fn make_consistent(observation: &mut [f32], layout: &Layout) {
         }
     };
     let write = |observation: &mut [f32], at: usize, q: Quat| {
-        observation[at..at + 4]
-            .iter_mut()
-            .zip(q)
-            .for_each(|(cell, x)| *cell = x as f32);
+        observation[at..at + 4].copy_from_slice(&q.map(|x| x as f32));
     };
     let [object_at, goal_at, relative_at] =
         [OBJECT_QUAT, GOAL_QUAT, RELATIVE_QUAT].map(|group| layout.start(group));

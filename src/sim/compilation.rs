@@ -159,9 +159,10 @@ impl Compilation {
             None => MjSpec::from_xml_string(BUILTIN),
             Some(file) => MjSpec::from_xml_vfs(file, &self.files.for_mujoco()),
         };
-        let whole = || file.and_then(parse_error);
-        let mut spec =
-            spec.map_err(|error| refused(whole().unwrap_or_else(|| error.to_string())))?;
+        let mut spec = spec.map_err(|error| {
+            let whole = file.and_then(parse_error);
+            refused(whole.unwrap_or_else(|| error.to_string()))
+        })?;
         if self.keeps_all() {
             return Ok(spec);
         }

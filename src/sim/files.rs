@@ -73,9 +73,11 @@ pub fn scene_files(scene: &Path) -> Result<Vec<PathBuf>> {
             } else if name.starts_with(b"file") {
                 named.push((near.clone(), value));
                 if [&b"include"[..], b"model"].contains(&&*element) {
-                    let is_new =
-                        |path: &PathBuf| path.canonicalize().is_ok_and(|end| known.insert(end));
-                    scenes.extend(places.into_iter().filter(is_new));
+                    scenes.extend(
+                        places
+                            .into_iter()
+                            .filter(|path| path.canonicalize().is_ok_and(|end| known.insert(end))),
+                    );
                 }
             }
         }

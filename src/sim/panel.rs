@@ -48,7 +48,7 @@ pub struct Readout {
 }
 
 /// The user's input.
-#[derive(Clone, Copy)]
+#[derive(Clone, Copy, Default)]
 pub struct Controls {
     /// Whether time is stopped except for single steps.
     pub paused: bool,

@@ -22,14 +22,13 @@ pub fn frames_within(model: &MjModel, top: usize) -> Vec<Option<Placed>> {
 
 /// The geoms of the bodies that have a pose, each with its own in the same frame.
 pub fn geoms_within(model: &MjModel, frames: &[Option<Placed>]) -> Vec<(usize, Placed)> {
-    let placed = |geom: usize| {
-        let frame = frames[model.geom_bodyid()[geom] as usize]?;
-        Some((
-            geom,
-            inside(frame, model.geom_pos()[geom], model.geom_quat()[geom]),
-        ))
-    };
-    (0..model.ngeom() as usize).filter_map(placed).collect()
+    (0..model.ngeom() as usize)
+        .filter_map(|geom| {
+            let frame = frames[model.geom_bodyid()[geom] as usize]?;
+            let place = inside(frame, model.geom_pos()[geom], model.geom_quat()[geom]);
+            Some((geom, place))
+        })
+        .collect()
 }
 
 /// A pose that is given in a frame as a pose in the surroundings of that frame.
@@ -43,11 +42,9 @@ pub fn inside((origin, axes): Placed, position: [f64; 3], orientation: Quat) -> 
 
 /// Whether a geom can be in a contact.
 pub fn touches(model: &MjModel, geom: usize) -> bool {
-    let pairs = [model.pair_geom1(), model.pair_geom2()];
+    let id = geom as i32;
     model.geom_contype()[geom] != 0
         || model.geom_conaffinity()[geom] != 0
-        || pairs
-            .into_iter()
-            .flatten()
-            .any(|&of_pair| of_pair == geom as i32)
+        || model.pair_geom1().contains(&id)
+        || model.pair_geom2().contains(&id)
 }

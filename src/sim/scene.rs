@@ -143,9 +143,8 @@ impl Scene {
             Cone::Pyramidal => model.opt_mut().cone = mjCONE_PYRAMIDAL as i32,
             Cone::Elliptic => model.opt_mut().cone = mjCONE_ELLIPTIC as i32,
         }
-        let halves = model.opt().integrator != mjINT_RK4 as i32;
         ensure!(
-            halves,
+            model.opt().integrator != mjINT_RK4 as i32,
             "the RK4 integrator cannot be stepped in halves; use implicitfast"
         );
         for (flag, bit) in NEEDED {
@@ -154,9 +153,8 @@ impl Scene {
                 "{flag} must not be disabled in its <flag>"
             );
         }
-        let awake = model.opt().enableflags & mjENBL_SLEEP as i32 == 0;
         ensure!(
-            awake,
+            model.opt().enableflags & mjENBL_SLEEP as i32 == 0,
             "sleep is not part of the state that MuJoCo can save; leave sleep switched off"
         );
         Ok(Self {
@@ -230,13 +228,10 @@ impl Scene {
 
     /// The names of its keyframes.
     pub fn keyframes(&self) -> Vec<String> {
-        let name = |id| {
-            self.model
-                .id_to_name(mjOBJ_KEY, id)
-                .unwrap_or_default()
-                .to_owned()
-        };
-        (0..self.model.nkey() as usize).map(name).collect()
+        let name = |id| self.model.id_to_name(mjOBJ_KEY, id).unwrap_or_default();
+        (0..self.model.nkey() as usize)
+            .map(|id| name(id).to_owned())
+            .collect()
     }
 
     /// Finds the body `name`.

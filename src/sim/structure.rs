@@ -67,8 +67,9 @@ impl Scene {
             .flatten()
             .map(|body| self.root_of(body))
             .collect();
-        let is_goal = |body: &usize| self.model.body_mocapid()[*body] >= 0 && !held.contains(body);
-        let goals: Vec<usize> = others.filter(is_goal).collect();
+        let goals: Vec<usize> = others
+            .filter(|body| self.model.body_mocapid()[*body] >= 0 && !held.contains(body))
+            .collect();
         self.name_only(
             &goals,
             &mut parts.goal,
@@ -101,12 +102,13 @@ impl Scene {
             .map(|body| self.root_of(body as usize))
             .filter(|tree| *tree > 0)
             .collect();
-        let is_hinge = |&joint: &usize| {
-            trees.contains(&self.root_of(self.model.jnt_bodyid()[joint] as usize))
-                && self.model.jnt_type()[joint] == mjJNT_HINGE
-                && self.model.jnt_limited()[joint]
-        };
-        let hinges: Vec<usize> = (0..self.model.njnt() as usize).filter(is_hinge).collect();
+        let hinges: Vec<usize> = (0..self.model.njnt() as usize)
+            .filter(|&joint| {
+                trees.contains(&self.root_of(self.model.jnt_bodyid()[joint] as usize))
+                    && self.model.jnt_type()[joint] == mjJNT_HINGE
+                    && self.model.jnt_limited()[joint]
+            })
+            .collect();
         if parts.joints.is_empty() {
             parts.joints = self.names(mjOBJ_JOINT, hinges.iter().copied(), problems);
         }
@@ -167,8 +169,9 @@ impl Scene {
                 _ => None,
             }
         };
-        let is_active = |&i: &usize| model.eq_active0()[i];
-        (0..model.neq() as usize).filter(is_active).filter_map(ends)
+        (0..model.neq() as usize)
+            .filter(|&i| model.eq_active0()[i])
+            .filter_map(ends)
     }
 
     /// Whether a joint is part of a loop that such a constraint closes: it moves one end without the other.
@@ -207,11 +210,9 @@ impl Scene {
                 .unwrap_or_default()
                 .to_owned()
         };
-        let joints = self
-            .wraps(actuator.id)
+        self.wraps(actuator.id)
             .into_iter()
-            .filter(|(kind, ..)| *kind == mjWRAP_JOINT);
-        joints
+            .filter(|(kind, ..)| *kind == mjWRAP_JOINT)
             .map(|(_, joint, coefficient)| (name(joint), coefficient))
             .collect()
     }
@@ -276,8 +277,8 @@ impl Scene {
             .map(|hinge| hinge.qpos)
             .chain([object.qpos])
             .collect();
-        let unknown = |joint: &usize| !known.contains(&(self.model.jnt_qposadr()[*joint] as usize));
-        let joints = (0..self.model.njnt() as usize).filter(unknown);
+        let joints = (0..self.model.njnt() as usize)
+            .filter(|&joint| !known.contains(&(self.model.jnt_qposadr()[joint] as usize)));
         let name = |joint| match self.model.id_to_name(mjOBJ_JOINT, joint) {
             Some(name) => format!("joint `{name}`"),
             None => format!("joint {joint}"),

@@ -32,13 +32,9 @@ impl Scene {
     /// With moving parts there is only the identity.
     pub fn symmetry(&self, body: Body) -> Vec<usize> {
         let form = self.form(body);
-        let turns = CUBE_ROTATIONS
-            .iter()
-            .map(|turn| quat::normalized(turn.map(f64::from)));
-        turns
-            .enumerate()
-            .filter(|&(i, turn)| i == 0 || form.holds(turn))
-            .map(|(i, _)| i)
+        let turn = |i: usize| quat::normalized(CUBE_ROTATIONS[i].map(f64::from));
+        (0..CUBE_ROTATIONS.len())
+            .filter(|&i| i == 0 || form.holds(turn(i)))
             .collect()
     }
 

@@ -36,12 +36,9 @@ impl Viewer {
         let mut viewer =
             attempt(build).map_err(|reason| anyhow!("cannot open a window: {reason}{HELP}"))?;
         let controls = Controls {
-            paused: false,
             speed: 1.0,
             choice: first,
-            steps: 0,
-            reset: false,
-            new_goal: false,
+            ..Controls::default()
         };
         let panel = Rc::new(RefCell::new(Panel {
             choices,

@@ -19,10 +19,7 @@ use crate::spaces::Spaces;
 use loss::Batch;
 
 /// The gradient backend in candle.
-pub struct Reference {
-    /// Its settings.
-    pub config: PpoConfig,
-}
+pub struct Reference;
 
 /// Gathers these samples of a rollout.
 fn gathered(policy: &Policy, rollout: &Rollout, samples: &[u32]) -> Result<Batch> {
@@ -61,6 +58,7 @@ impl GradientBackend for Reference {
     fn gradients(
         &mut self,
         policy: &Policy,
+        config: &PpoConfig,
         rollout: &Rollout,
         groups: &[&[u32]],
         count: usize,
@@ -83,7 +81,7 @@ impl GradientBackend for Reference {
                 &batch.observations,
                 &mut variables,
             )?;
-            let (total, losses) = loss::losses(&self.config, &batch, &means, &values)?;
+            let (total, losses) = loss::losses(config, &batch, &means, &values)?;
             sums.push(losses);
             let grads = (total * (group.len() as f64 / count as f64))?.backward()?;
             let mut gradient = vec![0.0; policy.layout.count()];
