@@ -99,6 +99,8 @@ impl Moment<'_> {
 pub struct Lane {
     /// The environment.
     pub env: Repose,
+    /// The number of its episode.
+    number: usize,
     noise: Rng,
     running: bool,
     end: Option<End>,
@@ -108,6 +110,7 @@ impl Lane {
     fn new(task: &Arc<Task>) -> Self {
         Self {
             env: Repose::new(task),
+            number: 0,
             noise: rng::stream(0, "unused", 0),
             running: false,
             end: None,
@@ -121,6 +124,7 @@ impl Lane {
         );
         self.env.take_sums();
         self.noise = rng::stream(episodes.seed, "play noise", episode as u64);
+        self.number = episode;
         self.running = true;
     }
 
@@ -205,9 +209,7 @@ impl Trial<'_> {
     pub fn score(&self, bar: &Bar, observe: &mut dyn FnMut(&Moment)) -> Result<Option<Score>> {
         let mut observer = |moment: Moment| {
             observe(&moment);
-            if moment.ends() {
-                bar.inc(1);
-            }
+            bar.inc(moment.ends().into());
             Ok(())
         };
         Ok(self
@@ -239,7 +241,8 @@ impl Trial<'_> {
                 }
                 group.step(observer)?;
             }
-            results.extend((first..).zip(group.lanes[..group.count].iter_mut().map(Lane::episode)));
+            let lanes = group.lanes.iter_mut();
+            results.extend(lanes.map(|lane| (lane.number, lane.episode())));
         }
         let mut all = exchange.all_gather(results).concat();
         all.sort_unstable_by_key(|(number, _)| *number);
@@ -255,11 +258,6 @@ struct Lanes<'a> {
     observations: Vec<f32>,
     /// `[LANES, A]`
     actions: Vec<f32>,
-
-    /// The number of the first episode.
-    first: usize,
-    /// The number of episodes, which the last group may have fewer of than lanes.
-    count: usize,
 }
 
 impl<'a> Lanes<'a> {
@@ -270,22 +268,16 @@ impl<'a> Lanes<'a> {
             lanes: lanes.map(|_| Lane::new(trial.task)).collect(),
             observations: vec![0.0; LANES * spaces.observation_size],
             actions: vec![0.0; LANES * spaces.action_size],
-            first: 0,
-            count: 0,
         }
     }
 
-    /// Starts the episodes from number `first` on.
+    /// Starts the episodes from number `first` on. The last group may have fewer of them than lanes.
     fn start(&mut self, first: usize, observer: &mut Observer) -> Result<()> {
         let episodes = self.trial.episodes;
-        self.first = first;
-        self.count = self
-            .lanes
-            .len()
-            .min(episodes.first + episodes.count - first);
+        self.lanes.truncate(episodes.first + episodes.count - first);
         let size = self.trial.task.spaces().observation_size;
         let rows = self.observations.par_chunks_exact_mut(size);
-        self.lanes[..self.count]
+        self.lanes
             .par_iter_mut()
             .zip(rows)
             .enumerate()
@@ -295,9 +287,9 @@ impl<'a> Lanes<'a> {
                 });
             });
         let rows = self.observations.chunks_exact(size);
-        for (i, (lane, observation)) in self.lanes[..self.count].iter().zip(rows).enumerate() {
+        for (lane, observation) in self.lanes.iter().zip(rows) {
             observer(Moment {
-                episode: first + i,
+                episode: lane.number,
                 env: &lane.env,
                 observation,
                 step: None,
@@ -313,8 +305,6 @@ impl<'a> Lanes<'a> {
             lanes,
             observations,
             actions,
-            first,
-            ..
         } = self;
         let Spaces {
             observation_size,
@@ -325,32 +315,26 @@ impl<'a> Lanes<'a> {
         let acted = lanes
             .par_iter_mut()
             .zip(actions.par_chunks_exact(action_size));
-        let rows = acted
+        acted
             .zip(observations.par_chunks_exact_mut(observation_size))
-            .enumerate();
-        rows.filter(|(_, ((lane, _), _))| lane.running)
-            .try_for_each(|(i, ((lane, action), row))| {
+            .filter(|((lane, _), _)| lane.running)
+            .try_for_each(|((lane, action), row)| {
                 ensure!(action.iter().all(|x| x.is_finite()), NOT_FINITE);
-                let episode = *first + i;
-                let stepped = stepping("episode", episode, || caught(|| lane.step(action, row)));
-                stepped.map_err(|panic| anyhow!("episode {episode} panicked: {panic}"))?;
+                let number = lane.number;
+                let stepped = stepping("episode", number, || caught(|| lane.step(action, row)));
+                stepped.map_err(|panic| anyhow!("episode {number} panicked: {panic}"))?;
                 Ok(())
             })?;
         let rows = observations
             .chunks_exact(observation_size)
             .zip(actions.chunks_exact(action_size));
-        let running = lanes
-            .iter_mut()
-            .zip(rows)
-            .enumerate()
-            .filter(|(_, (lane, _))| lane.running);
-        for (i, (lane, (observation, action))) in running {
-            let step = Some((action, lane.end));
+        let running = lanes.iter_mut().zip(rows);
+        for (lane, (observation, action)) in running.filter(|(lane, _)| lane.running) {
             observer(Moment {
-                episode: *first + i,
+                episode: lane.number,
                 env: &lane.env,
                 observation,
-                step,
+                step: Some((action, lane.end)),
             })?;
             lane.running = lane.end.is_none();
         }

@@ -120,7 +120,10 @@ impl PolicySource {
     /// Fails as [`settings`] does.
     fn settings(&self, checkpoint: &Checkpoint, overrides: &[Override]) -> Result<Config> {
         let path = self.path();
-        let config = settings(checkpoint, path, player(checkpoint), overrides);
+        let player = Reader::Player {
+            env_steps: checkpoint.progress.env_steps,
+        };
+        let config = settings(checkpoint, path, player, overrides);
         match self {
             Self::BuiltIn(_) => config,
             Self::File(_) => config.with_context(|| cannot_use(path)),
@@ -295,13 +298,6 @@ pub fn settings(
         .resolve()?;
     expect_policy(checkpoint, &config.ppo)?;
     Ok(config)
-}
-
-/// What plays the policy of a checkpoint.
-fn player(checkpoint: &Checkpoint) -> Reader {
-    Reader::Player {
-        env_steps: checkpoint.progress.env_steps,
-    }
 }
 
 /// The settings in a checkpoint in the file `path`, as text.

@@ -238,10 +238,8 @@ fn mean_kept(rows: &[Scored]) -> f64 {
 fn as_json(rows: &[Scored], episodes: usize, seed: u64, checkpoint: &str) -> Value {
     let of_row = |row: &Scored| {
         let value = |set: &Override| {
-            let table: toml::Table = format!("value = {}", set.value)
-                .parse()
-                .expect("the values are TOML");
-            (set.key.clone(), json!(table["value"]))
+            let value: toml::Value = set.value.parse().expect("the values are TOML");
+            (set.key.clone(), json!(value))
         };
         json!({
             "name": row.condition.name,
@@ -311,14 +309,10 @@ fn picture(rows: &[Scored], episodes: usize, checkpoint: &str) -> BarChart {
         .filter(|row| row.condition.is_in_grid())
         .map(|row| row.kept)
         .collect();
-    let row = |mass: usize| {
-        grid.iter()
-            .skip(mass)
-            .step_by(MASSES.len())
-            .copied()
-            .collect()
-    };
-    let cells = (0..MASSES.len()).map(row).collect();
+    let of_mass = |mass| grid.iter().skip(mass).step_by(MASSES.len());
+    let cells = (0..MASSES.len())
+        .map(|mass| of_mass(mass).copied().collect())
+        .collect();
     let named = |name: &str, values: &[&str]| {
         values
             .iter()

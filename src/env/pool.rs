@@ -81,7 +81,8 @@ impl<E: Env> EnvPool<E> {
         let all = in_shard * exchange.shards;
         let sizes = block_sizes(in_shard, all);
         let first_block = shards.start * sizes.len();
-        let member = |(number, env)| Member {
+        let members = (shards.start * in_shard..).zip(envs);
+        let mut members = members.map(|(number, env)| Member {
             env,
             end: None,
             final_observation: vec![0.0; spaces.observation_size],
@@ -89,19 +90,16 @@ impl<E: Env> EnvPool<E> {
             seed,
             next_episode: number as u64,
             stride: all as u64,
-        };
-        let mut members = (shards.start * in_shard..).zip(envs).map(member);
-        let block = |(number, size)| EnvBlock {
+        });
+        let blocks = (first_block..).zip(sizes.repeat(shards.len()));
+        let blocks = blocks.map(|(number, size)| EnvBlock {
             number,
             members: members.by_ref().take(size).collect(),
             spaces,
             finished: Vec::new(),
-        };
+        });
         Self {
-            blocks: (first_block..)
-                .zip(sizes.repeat(shards.len()))
-                .map(block)
-                .collect(),
+            blocks: blocks.collect(),
         }
     }
 

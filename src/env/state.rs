@@ -46,12 +46,9 @@ impl EnvState {
     pub fn rows(&self, count: usize) -> Result<impl Iterator<Item = SavedEnv<'_>>> {
         let numbers = self.numbers.len();
         let counters = self.counters.len();
-        let even = numbers.is_multiple_of(count)
-            && counters.is_multiple_of(count)
-            && numbers >= count
-            && counters >= count;
+        let mut found = [numbers, counters].into_iter();
         ensure!(
-            even,
+            found.all(|found| found >= count && found.is_multiple_of(count)),
             "{numbers} numbers and {counters} counters are not the states of {count} environments"
         );
         let rows = self

@@ -120,7 +120,7 @@ impl Ppo {
             }
             // The normaliser is part of the policy, which does not change while the critic learns alone.
             if !self.is_critic_alone(iteration) {
-                let seen: Vec<&[f32]> = rollout.blocks.iter().map(RolloutBlock::acted_on).collect();
+                let seen: Vec<_> = rollout.blocks.iter().map(RolloutBlock::acted_on).collect();
                 self.policy.see(&seen, &self.exchange);
             }
             Ok(Some(self.stats(&steps, explained_variance)))

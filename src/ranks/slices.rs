@@ -25,14 +25,13 @@ impl Exchange {
     /// Deals these chunks of an array, which follow one another, to the ranks.
     pub fn slices(&self, chunks: Vec<Range<usize>>) -> Slices {
         let end = |count: usize| chunks[..count].last().map_or(0, |chunk| chunk.end);
-        let values = |rank| {
-            let dealt = part(chunks.len(), rank, self.size);
-            end(dealt.start)..end(dealt.end)
-        };
-        let all: Vec<Range<usize>> = (0..self.size).map(values).collect();
+        let of_rank = |rank| part(chunks.len(), rank, self.size);
+        let all: Vec<_> = (0..self.size)
+            .map(|rank| end(of_rank(rank).start)..end(of_rank(rank).end))
+            .collect();
         Slices {
             exchange: self.clone(),
-            dealt: self.own(chunks.len()),
+            dealt: of_rank(self.rank),
             own: all[self.rank].clone(),
             chunks,
             all,
@@ -61,7 +60,7 @@ impl Slices {
         parts.for_each(|(chunk, out)| sum(chunk, out));
         let parts = self.exchange.all_to_all(numbers, &self.all);
         // A rank without values has no chunks either, so the length does not matter.
-        let parts: Vec<&[f32]> = parts.chunks(self.own.len().max(1)).collect();
+        let parts: Vec<_> = parts.chunks(self.own.len().max(1)).collect();
         let add_and_of = |(chunk, out): (Range<usize>, &mut [f32])| {
             tree_sum(
                 out,

@@ -66,7 +66,7 @@ impl Hand {
                 }
             }
         }
-        scene.find_parts(&parts)
+        scene.find_parts(parts)
     }
 
     /// Binds these parts of `scene`, all of which are named but for the start.

@@ -37,11 +37,9 @@ impl Mirror {
         let compare = |at: usize| {
             let [x, y, z, own @ ..] = here.tips[at];
             let [a, b, c, other @ ..] = policy.tips[at];
-            let apart = [x - a, -y - b, z - c]
-                .into_iter()
-                .map(f64::abs)
-                .fold(0.0, f64::max);
-            (apart, quat::mul(quat::conj(mirrored(own)), other))
+            let apart = [x - a, y + b, z - c].map(f64::abs);
+            let between = quat::mul(quat::conj(mirrored(own)), other);
+            (apart.into_iter().fold(0.0, f64::max), between)
         };
         let mut tips = Vec::new();
         for (i, start) in layout.tips().enumerate() {

@@ -3,7 +3,7 @@
 use anyhow::{Result, bail};
 use rand_distr::{Distribution, StandardNormal};
 
-use super::observation::{GOAL_QUAT, Group, Layout, OBJECT_QUAT, RELATIVE_QUAT, TIP_QUAT};
+use super::observation::{GOAL_QUAT, Layout, OBJECT_QUAT, RELATIVE_QUAT, TIP_QUAT};
 use crate::config::ByGroup;
 use crate::os::shortened;
 use crate::quat::{self, Quat};
@@ -35,23 +35,14 @@ impl NoiseStd {
                 );
             }
         }
-        let of_group = |Group {
-                            name,
-                            start,
-                            length,
-                            ..
-                        }: Group| {
-            let std = groups.get(name).copied().unwrap_or(0.0) as f32;
-            (start..start + length).map(move |i| (i, std))
-        };
-        Ok(Self(
-            layout
-                .groups
-                .into_iter()
-                .flat_map(of_group)
-                .filter(|&(_, std)| std != 0.0)
-                .collect(),
-        ))
+        let mut all = Vec::new();
+        for group in layout.groups {
+            let std = groups.get(group.name).map_or(0.0, |&std| std as f32);
+            if std != 0.0 {
+                all.extend(group.cells().map(|i| (i, std)));
+            }
+        }
+        Ok(Self(all))
     }
 
     /// Whether nothing is added to any value.

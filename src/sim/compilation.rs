@@ -241,8 +241,9 @@ fn add_goal(spec: &mut MjSpec, compiled: &MjModel, name: &str, goal: &str) -> Re
         .name_to_id(mjOBJ_BODY, name)
         .context("a body of the compiled scene")?;
     let frames = frames_within(compiled, object);
-    let shown = spec.world_body_mut().add_body();
-    shown
+    let shown = spec
+        .world_body_mut()
+        .add_body()
         .with_name(goal)
         .with_pos(compiled.body_pos()[object])
         .with_mocap(true);
@@ -257,11 +258,13 @@ fn add_goal(spec: &mut MjSpec, compiled: &MjModel, name: &str, goal: &str) -> Re
             let moved = quat::rotate(quat, compiled.mesh_pos()[mesh]);
             pos = [0, 1, 2].map(|axis| pos[axis] - moved[axis]);
         }
-        let copy = only_seen(shown)
+        only_seen(shown)
             .with_type(kind)
-            .with_size(compiled.geom_size()[geom]);
-        copy.with_pos(pos).with_quat(quat).with_meshname(mesh_name);
-        copy.with_group(compiled.geom_group()[geom])
+            .with_size(compiled.geom_size()[geom])
+            .with_pos(pos)
+            .with_quat(quat)
+            .with_meshname(mesh_name)
+            .with_group(compiled.geom_group()[geom])
             .with_rgba([0.2, 0.8, 0.2, 0.4]);
     }
     Ok(())

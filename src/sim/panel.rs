@@ -203,13 +203,7 @@ fn draw_gauge(ui: &mut Ui, gauge: &Gauge) {
     } else {
         rect.left()
     };
-    let end = zero
-        + fraction
-            * if gauge.signed {
-                rect.width() / 2.0
-            } else {
-                rect.width()
-            };
+    let end = zero + fraction * (rect.right() - zero);
     let painter = ui.painter();
     painter.rect_filled(rect, 2.0, ui.visuals().extreme_bg_color);
     let bar = Rect::from_min_max(

@@ -2,6 +2,7 @@
 
 use mujoco_rs::prelude::MjModel;
 
+use super::constants::ids;
 use crate::quat::{self, Quat};
 
 /// A position in m, and an orientation.
@@ -22,7 +23,7 @@ pub fn frames_within(model: &MjModel, top: usize) -> Vec<Option<Placed>> {
 
 /// The geoms of the bodies that have a pose, each with its own in the same frame.
 pub fn geoms_within(model: &MjModel, frames: &[Option<Placed>]) -> Vec<(usize, Placed)> {
-    (0..model.ngeom() as usize)
+    ids(model.ngeom())
         .filter_map(|geom| {
             let frame = frames[model.geom_bodyid()[geom] as usize]?;
             let place = inside(frame, model.geom_pos()[geom], model.geom_quat()[geom]);

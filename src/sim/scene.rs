@@ -229,7 +229,7 @@ impl Scene {
     /// The names of its keyframes.
     pub fn keyframes(&self) -> Vec<String> {
         let name = |id| self.model.id_to_name(mjOBJ_KEY, id).unwrap_or_default();
-        (0..self.model.nkey() as usize)
+        ids(self.model.nkey())
             .map(|id| name(id).to_owned())
             .collect()
     }
@@ -313,9 +313,15 @@ impl Scene {
             model.actuator_dyntype()[id] == mjDYN_NONE && model.actuator_delay()[id] == 0.0;
         let ctrl = model.actuator_ctrladr()[id] as usize;
         let is_limited = model.actuator_ctrlnum()[id] == 1 && model.actuator_ctrllimited()[ctrl];
+        // The force is kp · (control - length), with or without damping.
+        let kp = model.actuator_gainprm()[id][0];
+        let is_servo = model.actuator_gaintype()[id] == mjGAIN_FIXED
+            && model.actuator_biastype()[id] == mjBIAS_AFFINE
+            && kp > 0.0
+            && model.actuator_biasprm()[id][..2] == [0.0, -kp];
         for (holds, what) in [
             (
-                self.is_position_servo(id),
+                is_servo,
                 "be a position servo (<position>): its control is an angle",
             ),
             (
@@ -343,14 +349,5 @@ impl Scene {
         self.model
             .name_to_id(kind, name)
             .with_context(|| format!("has no {what} `{}`", shortened(name)))
-    }
-
-    /// Whether the force is kp · (control - length), with or without damping.
-    fn is_position_servo(&self, id: usize) -> bool {
-        let kp = self.model.actuator_gainprm()[id][0];
-        self.model.actuator_gaintype()[id] == mjGAIN_FIXED
-            && self.model.actuator_biastype()[id] == mjBIAS_AFFINE
-            && kp > 0.0
-            && self.model.actuator_biasprm()[id][..2] == [0.0, -kp]
     }
 }

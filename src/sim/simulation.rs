@@ -111,7 +111,7 @@ impl Simulation {
     pub fn follow(&mut self) -> bool {
         let model = self.data.model().clone();
         let is_tie = |&i: &usize| model.eq_type()[i] == mjEQ_JOINT && model.eq_active0()[i];
-        let ties: Vec<usize> = (0..model.neq() as usize).filter(is_tie).collect();
+        let ties: Vec<usize> = ids(model.neq()).filter(is_tie).collect();
         let from_reference = |qpos: &[f64], joint: i32| {
             let place = *model.jnt_qposadr().get(joint as usize)? as usize;
             Some(qpos[place] - model.qpos0()[place])

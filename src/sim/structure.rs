@@ -43,8 +43,7 @@ impl Scene {
     ///
     /// # Errors
     /// Fails with one message on all that is missing or ambiguous, and the settings that mend it.
-    pub fn find_parts(&self, named: &Parts) -> Result<Parts> {
-        let mut parts = named.clone();
+    pub fn find_parts(&self, mut parts: Parts) -> Result<Parts> {
         let mut problems = Problems::new();
         let hand = self.find_hand(&mut parts, &mut problems);
         let others =
@@ -83,8 +82,7 @@ impl Scene {
     /// Names the parts of the hand that are not named. The result is the first bodies of the trees that its actuators move.
     fn find_hand(&self, parts: &mut Parts, problems: &mut Problems) -> BTreeSet<usize> {
         if parts.actuators.is_empty() {
-            parts.actuators =
-                self.names(mjOBJ_ACTUATOR, 0..self.model.nactuator() as usize, problems);
+            parts.actuators = self.names(mjOBJ_ACTUATOR, ids(self.model.nactuator()), problems);
         }
         let actuators = parts
             .actuators
@@ -102,7 +100,7 @@ impl Scene {
             .map(|body| self.root_of(body as usize))
             .filter(|tree| *tree > 0)
             .collect();
-        let hinges: Vec<usize> = (0..self.model.njnt() as usize)
+        let hinges: Vec<usize> = ids(self.model.njnt())
             .filter(|&joint| {
                 trees.contains(&self.root_of(self.model.jnt_bodyid()[joint] as usize))
                     && self.model.jnt_type()[joint] == mjJNT_HINGE
@@ -169,7 +167,7 @@ impl Scene {
                 _ => None,
             }
         };
-        (0..model.neq() as usize)
+        ids(model.neq())
             .filter(|&i| model.eq_active0()[i])
             .filter_map(ends)
     }
@@ -263,11 +261,7 @@ impl Scene {
 
     /// The names of all joints that have one.
     pub fn joints(&self) -> Vec<String> {
-        self.names(
-            mjOBJ_JOINT,
-            0..self.model.njnt() as usize,
-            &mut Problems::new(),
-        )
+        self.names(mjOBJ_JOINT, ids(self.model.njnt()), &mut Problems::new())
     }
 
     /// The joints besides these hinges and the joint of this object, by name or number.
@@ -277,7 +271,7 @@ impl Scene {
             .map(|hinge| hinge.qpos)
             .chain([object.qpos])
             .collect();
-        let joints = (0..self.model.njnt() as usize)
+        let joints = ids(self.model.njnt())
             .filter(|&joint| !known.contains(&(self.model.jnt_qposadr()[joint] as usize)));
         let name = |joint| match self.model.id_to_name(mjOBJ_JOINT, joint) {
             Some(name) => format!("joint `{name}`"),
@@ -290,7 +284,7 @@ impl Scene {
     pub fn actuators(&self) -> Vec<String> {
         self.names(
             mjOBJ_ACTUATOR,
-            0..self.model.nactuator() as usize,
+            ids(self.model.nactuator()),
             &mut Problems::new(),
         )
     }

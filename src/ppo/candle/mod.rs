@@ -105,16 +105,7 @@ fn forward(
     variables: &mut Vec<(Range<usize>, Var)>,
 ) -> Result<Tensor> {
     let mut x = x.clone();
-    for (
-        i,
-        Layer {
-            inputs,
-            outputs,
-            weight,
-            bias,
-        },
-    ) in layers.iter().enumerate()
-    {
+    for (i, layer) in layers.iter().enumerate() {
         let mut variable = |range: &Range<usize>, shape: &[usize]| -> Result<Tensor> {
             let variable = Var::from_slice(&policy.parameters[range.clone()], shape, &Device::Cpu)?;
             variables.push((range.clone(), variable.clone()));
@@ -127,11 +118,9 @@ fn forward(
                 Activation::Tanh => x.tanh(),
             }?;
         }
-        let layer = Linear::new(
-            variable(weight, &[*outputs, *inputs])?,
-            Some(variable(bias, &[*outputs])?),
-        );
-        x = layer.forward(&x)?;
+        let weight = variable(&layer.weight, &[layer.outputs, layer.inputs])?;
+        let bias = variable(&layer.bias, &[layer.outputs])?;
+        x = Linear::new(weight, Some(bias)).forward(&x)?;
     }
     Ok(x)
 }

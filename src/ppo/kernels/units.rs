@@ -47,13 +47,10 @@ pub fn request() -> Result<&'static dyn Unit> {
 }
 
 fn checked(unit: Answer<&'static str>, wrong: &'static str) -> Answer<&'static str> {
-    unit.and_then(|unit| {
-        if multiplies_rightly(unit) {
-            Ok(unit)
-        } else {
-            Err(wrong)
-        }
-    })
+    match unit {
+        Ok(unit) if !multiplies_rightly(unit) => Err(wrong),
+        answer => answer,
+    }
 }
 
 /// Whether products of whole numbers, which need no rounding, are exact.
