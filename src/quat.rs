@@ -23,13 +23,6 @@ pub const CUBE_ROTATIONS: [[f32; 4]; 24] = [
     [H, H, -H, -H], [H, -H, H, -H], [H, -H, -H, H], [H, -H, -H, -H],
 ];
 
-/// A set of the rotations of a cube, given by their numbers, as bits.
-pub fn mask(rotations: &[usize]) -> u32 {
-    rotations
-        .iter()
-        .fold(0, |mask, rotation| mask | 1 << rotation)
-}
-
 /// The Hamilton product `a ⊗ b`: first the rotation `b`, then `a`.
 pub fn mul<T: Copy + Mul<Output = T> + Add<Output = T> + Sub<Output = T>>(
     [aw, ax, ay, az]: [T; 4],

@@ -213,9 +213,8 @@ fn conditions() -> Vec<Condition> {
     }
     for friction in FRICTIONS {
         for mass in MASSES {
-            let name = format!("friction {friction}, cube mass {mass}");
             conditions.push(Condition {
-                name,
+                name: format!("friction {friction}, cube mass {mass}"),
                 sets: vec![set(FRICTION, friction), set(MASS, mass)],
             });
         }

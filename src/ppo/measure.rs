@@ -48,14 +48,11 @@ pub fn time_gradient_steps(
         all += taken;
         seconds.push(taken);
     }
-    let worked = os::processor_seconds()
-        .zip(before)
-        .map(|(after, before)| after - before);
     let of_threads = all * rayon::current_num_threads() as f64;
-    Ok((
-        seconds,
-        worked.map(|worked| (1.0 - worked / of_threads).max(0.0)),
-    ))
+    let waiting = os::processor_seconds()
+        .zip(before)
+        .map(|(after, before)| (1.0 - (after - before) / of_threads).max(0.0));
+    Ok((seconds, waiting))
 }
 
 /// The matrix products of one forward and backward pass: sizes of weights `[outputs, inputs]`, and whether the

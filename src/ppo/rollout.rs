@@ -68,15 +68,14 @@ impl Rollout {
                 observation_size,
             }
         };
-        let blocks: Vec<RolloutBlock> = block_sizes.iter().map(block).collect();
-        let mut places = Vec::new();
-        for (i, block) in blocks.iter().enumerate() {
-            places.extend((0..block.samples() as u32).map(|row| (i as u32, row)));
-        }
+        let blocks: Vec<_> = block_sizes.iter().map(block).collect();
+        let rows = |(i, block): (usize, &RolloutBlock)| {
+            (0..block.samples() as u32).map(move |row| (i as u32, row))
+        };
         Self {
             horizon,
+            places: blocks.iter().enumerate().flat_map(rows).collect(),
             blocks,
-            places,
         }
     }
 

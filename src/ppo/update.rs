@@ -92,8 +92,10 @@ impl Ppo {
             let size = self
                 .config
                 .minibatch_of(self.exchange.of_all(samples), rollout.horizon);
-            let stream = |shard| rng::stream(self.seed, "shuffle", iteration << 32 | shard as u64);
-            let shuffles = self.exchange.own_shards().map(stream).collect();
+            let own = self.exchange.own_shards();
+            let shuffles = own
+                .map(|shard| rng::stream(self.seed, "shuffle", iteration << 32 | shard as u64))
+                .collect();
             let mut minibatches = self.exchange.epochs(samples, size, shuffles);
             let mut steps = Vec::new();
             for epoch in 0..self.config.epochs {

@@ -1,6 +1,7 @@
 //! The conditions of an episode besides the task itself: the physics that it has drawn, forces and assistance on the object, delay
 //! and noise.
 
+use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use super::randomization::{EpisodePhysics, Randomization};
@@ -11,6 +12,7 @@ use crate::rng::{self, Rng};
 use crate::sim::Simulation;
 
 /// The conditions of the current episode of one environment.
+#[derive(Default)]
 pub struct Conditions {
     randomization: Option<Arc<Randomization>>,
     /// What the episode has drawn, if it is randomised.
@@ -19,18 +21,15 @@ pub struct Conditions {
     assisted: f64,
     /// Whether the last torque was not zero.
     twisted: bool,
-    /// What is added to the values of every observation of the episode, in the order of the values.
-    bias: Vec<(usize, f32)>,
+    /// What is added to the values of every observation of the episode, by the number of the value.
+    bias: BTreeMap<usize, f32>,
 }
 
 impl Conditions {
     pub fn new(randomization: Option<&Arc<Randomization>>) -> Self {
         Self {
             randomization: randomization.cloned(),
-            draw: None,
-            assisted: 0.0,
-            twisted: false,
-            bias: Vec::new(),
+            ..Self::default()
         }
     }
 
@@ -44,11 +43,7 @@ impl Conditions {
         self.assisted =
             (2.0 * rng::uniform(&mut rng::beside(rng, "assist"), 0.0, 1.0) - 1.0).max(0.0);
         self.twisted = false;
-        self.bias.clear();
-        sensing::combine(
-            &mut self.bias,
-            task.bias.draw(&mut rng::beside(rng, "bias")),
-        );
+        self.bias = task.bias.draw(&mut rng::beside(rng, "bias")).collect();
         let Some(randomization) = &self.randomization else {
             return;
         };
@@ -56,7 +51,9 @@ impl Conditions {
         sim.change_scene(scene, &changes);
         if self.draw.as_ref().is_some_and(|draw| draw.has_bias) {
             let rng = &mut rng::beside(rng, "bias of randomization");
-            sensing::combine(&mut self.bias, randomization.bias.draw(rng));
+            for (i, added) in randomization.bias.draw(rng) {
+                *self.bias.entry(i).or_default() += added;
+            }
         }
     }
 

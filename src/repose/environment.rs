@@ -339,7 +339,7 @@ impl Resumable for Repose {
 
     fn restore(&mut self, state: &mut SavedEnv, observation: &mut [f32]) -> Result<()> {
         self.rng = rng::at(state.counters()?);
-        let [age, held] = state.counters()?;
+        let [age, held, randomized] = state.counters()?;
         // `age` has no tighter limit: a fork may have shorter episodes.
         ensure!(
             age <= u64::from(u32::MAX / 2) && held <= age,
@@ -347,7 +347,6 @@ impl Resumable for Repose {
         );
         self.age = age as u32;
         self.held = held as u32;
-        let [randomized] = state.counters()?;
         ensure!(
             randomized <= 1,
             "the mark of a randomised episode is {randomized}, not 0 or 1"

@@ -2,7 +2,6 @@
 
 use std::ops::Range;
 
-use crate::quat;
 use crate::spaces::{ObjectAndGoal, Spaces};
 use Sensing::{Known, Measured};
 
@@ -154,7 +153,7 @@ impl Layout {
                 object,
                 goal,
                 relative,
-                rotations: quat::mask(rotations),
+                rotations: rotations.iter().fold(0, |mask, i| mask | 1 << i),
             }),
             distance: rotation_error,
         }

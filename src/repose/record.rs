@@ -77,8 +77,7 @@ impl Record {
             "its metadata `hand` has {} bytes; at most {LONGEST} are read",
             text.len()
         );
-        let record = serde_json::from_str::<Self>(text);
-        let record = record
+        let record: Self = serde_json::from_str(text)
             .map_err(|error| anyhow!("its metadata `hand`: {}", shortened(&error.to_string())))?;
         let actuators = record.actuators.len();
         let tips = POSES.len() * record.fingertips.len();

@@ -1,5 +1,7 @@
 //! What a real sensor would add to an observation: white noise, and an offset that stays the same through an episode.
 
+use std::collections::BTreeMap;
+
 use anyhow::{Result, bail};
 use rand_distr::{Distribution, StandardNormal};
 
@@ -58,28 +60,15 @@ impl NoiseStd {
     }
 }
 
-/// Adds offsets to others. Both are in the order of the values of an observation.
-pub fn combine(bias: &mut Vec<(usize, f32)>, more: impl Iterator<Item = (usize, f32)>) {
-    for (i, added) in more {
-        match bias.binary_search_by_key(&i, |&(i, _)| i) {
-            Ok(at) => bias[at].1 += added,
-            Err(at) => bias.insert(at, (i, added)),
-        }
-    }
-}
-
-/// Adds the offset of an episode. On an orientation q it is a small rotation q ⊗ (1, v), where v are the last three of its four
+/// Adds the offset of an episode, which has these parts by the numbers of the values. On an orientation q it is a small rotation q ⊗ (1, v), where v are the last three of its four
 /// numbers. It stays the same however the body turns.
-pub fn offset(observation: &mut [f32], bias: &[(usize, f32)], layout: &Layout) {
+pub fn offset(observation: &mut [f32], bias: &BTreeMap<usize, f32>, layout: &Layout) {
     let orientations = || {
         let tips = layout.tips().map(|tip| tip + TIP_QUAT);
         tips.chain([layout.start(OBJECT_QUAT)])
     };
-    let of_value = |i: usize| {
-        bias.binary_search_by_key(&i, |&(i, _)| i)
-            .map_or(0.0, |at| bias[at].1)
-    };
-    for &(i, added) in bias {
+    let of_value = |i: usize| bias.get(&i).copied().unwrap_or_default();
+    for (&i, added) in bias {
         if !orientations().any(|at| (at..at + 4).contains(&i)) {
             observation[i] += added;
         }
@@ -178,7 +167,7 @@ mod tests {
     #[test]
     fn the_offset_of_an_orientation_is_the_same_rotation_however_the_cube_lies() {
         let bias = spread(&[("cube_quat", 0.05), ("joint_pos", 0.1)]).unwrap();
-        let bias: Vec<(usize, f32)> = bias.draw(&mut rng::stream(1, "bias", 0)).collect();
+        let bias: BTreeMap<usize, f32> = bias.draw(&mut rng::stream(1, "bias", 0)).collect();
         let mut turns = rng::stream(2, "turns", 0);
         let mut off = || {
             let q = quat::canonical(quat::uniform(
@@ -188,10 +177,7 @@ mod tests {
             observation[shadow().start(OBJECT_QUAT)..][..4].copy_from_slice(&q.map(|x| x as f32));
             offset(&mut observation, &bias, &shadow());
             make_consistent(&mut observation, &shadow());
-            assert_eq!(
-                observation[5],
-                0.1 + bias.iter().find(|(i, _)| *i == 5).unwrap().1
-            );
+            assert_eq!(observation[5], 0.1 + bias[&5]);
             assert_eq!(observation[30], 0.1);
             let seen =
                 [0, 1, 2, 3].map(|i| f64::from(observation[shadow().start(OBJECT_QUAT) + i]));

@@ -91,11 +91,8 @@ impl Task {
         settle_sizes(&mut config, &hand, file)?;
         let noise = NoiseStd::new(&config.noise, &hand.layout).context("env.noise")?;
         let bias = NoiseStd::new(&config.bias, &hand.layout).context("env.bias")?;
-        let predictor = (config.prediction > 0)
-            .then(|| Predictor::new(&scene, &hand, &config))
-            .transpose()
-            .with_context(|| origin(file))?;
         Ok(Arc::new(Self {
+            predictor: Predictor::new(&scene, &hand, &config)?,
             symmetry: scene.symmetry(hand.object.body),
             scene,
             compilation,
@@ -104,7 +101,6 @@ impl Task {
             noise,
             bias,
             mirror: None,
-            predictor: predictor.map(Arc::new),
             warnings: Vec::new(),
         }))
     }

@@ -135,8 +135,9 @@ impl Compilation {
     /// Fails with MuJoCo's own message if MuJoCo refuses the scene, or if a name is not UTF-8 or very long.
     pub(super) fn finish(&self, mut spec: MjSpec) -> Result<MjModel> {
         // MuJoCo compiles on threads, and ends the process if the system refuses one.
-        let thread = thread::Builder::new().spawn(|| ());
-        thread.context("the system refuses a thread")?;
+        thread::Builder::new()
+            .spawn(|| ())
+            .context("the system refuses a thread")?;
         let model = spec
             .compile_with_vfs(&self.files.for_mujoco())
             .map_err(refused)?;

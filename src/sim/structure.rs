@@ -140,8 +140,8 @@ impl Scene {
             *part = self.names(mjOBJ_BODY, [only], problems).concat();
             return;
         }
-        let names = self.names(mjOBJ_BODY, found.iter().copied(), &mut Problems::new());
-        let names: Vec<String> = names
+        let names: Vec<_> = self
+            .names(mjOBJ_BODY, found.iter().copied(), &mut Problems::new())
             .iter()
             .map(|name| format!("`{}`", shortened(name)))
             .collect();
