@@ -60,9 +60,8 @@ impl PolicySource {
     /// Fails if there is no such file, run folder or checkpoint, or if the name is of an actor without a policy.
     pub fn find(place: &Path) -> Result<Self> {
         let name = place.display();
-        let needs_none = Actor::without_policy(place).is_some();
         ensure!(
-            !needs_none,
+            Actor::without_policy(place).is_none(),
             "`{name}` acts without a policy; a file or folder of that name is ./{name}"
         );
         match BUILTIN

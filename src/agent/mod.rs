@@ -84,8 +84,8 @@ impl Agent<Repose> {
     /// Fails if this machine does not support the precision, or if the scene cannot be randomised in the way that is asked.
     pub fn for_task(task: &Arc<Task>, config: &Config, exchange: Exchange) -> Result<Self> {
         let randomization = Randomization::new(task, &config.randomization)?;
-        let own = exchange.own(config.env.num_envs);
-        let envs = own
+        let envs = exchange
+            .own(config.env.num_envs)
             .map(|_| Repose::randomized(task, randomization.as_ref()))
             .collect();
         let settings = config.clone();

@@ -61,17 +61,18 @@ impl Repose {
         let delay = task.config.action_delay + drawn_delay;
         let memory = delay.max(task.config.prediction) as usize;
         let scene = randomization.map_or(&task.scene, |randomization| &randomization.nominal);
+        let actuators = task.hand.actuators.len();
         Self {
             sim: Simulation::new(scene),
-            servos: Servos::new(task.hand.actuators.len(), memory),
+            servos: Servos::new(actuators, memory),
             conditions: Conditions::new(randomization),
             task: task.clone(),
             lesson: Lesson::task(&task.config),
             rng: rng::stream(0, "unused", 0),
             goal: [1.0, 0.0, 0.0, 0.0],
             last: Step {
-                action: vec![0.0; task.hand.actuators.len()],
-                previous_action: vec![0.0; task.hand.actuators.len()],
+                action: vec![0.0; actuators],
+                previous_action: vec![0.0; actuators],
                 joint_pos: vec![0.0; task.hand.joints.len()],
                 joint_vel: vec![0.0; task.hand.joints.len()],
                 ..Step::default()

@@ -1,6 +1,6 @@
 //! The hand in a scene: its parts in the task's order, bound once, and the layout of observations that follows from them.
 
-use anyhow::{Result, bail, ensure};
+use anyhow::{Error, Result, bail, ensure};
 
 use super::observation::Layout;
 use crate::sim::{Actuator, Body, Frame, FreeJoint, Hinge, Mocap, Parts, Scene};
@@ -82,21 +82,18 @@ impl Hand {
             &mut problems,
         );
         let fingertips = each(&parts.fingertips, |tip| scene.frame(tip), &mut problems);
-        let object = scene
-            .free_body(&parts.object)
-            .map_err(|error| problems.push(error.to_string()));
-        let goal = scene
-            .mocap(&parts.goal)
-            .map_err(|error| problems.push(error.to_string()));
-        let keyframe = scene
-            .start(&parts.start)
-            .map_err(|error| problems.push(error.to_string()));
+        let mut note = |error: Error| problems.push(error.to_string());
+        let object = scene.free_body(&parts.object).map_err(&mut note);
+        let goal = scene.mocap(&parts.goal).map_err(&mut note);
+        let keyframe = scene.start(&parts.start).map_err(&mut note);
         let driven: Vec<_> = actuators
             .iter()
             .map(|&actuator| scene.driven(actuator))
             .collect();
         for (joint, _) in driven.iter().flatten() {
-            problems.extend(scene.hinge(joint).err().map(|error| error.to_string()));
+            if let Err(error) = scene.hinge(joint) {
+                note(error);
+            }
         }
         problems.sort();
         problems.dedup();

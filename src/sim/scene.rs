@@ -203,18 +203,14 @@ impl Scene {
     /// Fails if there is no such body or its first joint is not a free joint.
     pub fn free_body(&self, name: &str) -> Result<FreeJoint> {
         let body = self.body(name)?;
-        let joint = self.free_joint(body.0);
-        let joint =
-            joint.with_context(|| format!("body `{}` must have a free joint", shortened(name)))?;
-        let [qpos, dof] = [
-            self.model.jnt_qposadr()[joint],
-            self.model.jnt_dofadr()[joint],
-        ]
-        .map(|at| at as usize);
+        let joint = self
+            .free_joint(body.0)
+            .with_context(|| format!("body `{}` must have a free joint", shortened(name)))?;
+        let dof = self.model.jnt_dofadr()[joint] as usize;
         let inertia = self.model.dof_m0()[dof + 3..dof + 6].iter().sum::<f64>() / 3.0;
         Ok(FreeJoint {
             body,
-            qpos,
+            qpos: self.model.jnt_qposadr()[joint] as usize,
             dof,
             inertia,
         })
