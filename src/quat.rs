@@ -1,13 +1,13 @@
 //! Unit quaternions as `[w, x, y, z]`, the order that MuJoCo uses. A quaternion and its negative are the same rotation.
 
-use std::f32::consts::FRAC_1_SQRT_2;
+use std::f32::consts::FRAC_1_SQRT_2 as R;
+use std::f64::consts::TAU;
 use std::ops::{Add, Mul, Sub};
 
 /// A unit quaternion w, x, y, z.
 pub type Quat = [f64; 4];
 
 const H: f32 = 0.5;
-const R: f32 = FRAC_1_SQRT_2;
 
 /// The rotations that map a cube onto itself, as w, x, y, z. Each pair q and -q has one entry.
 #[rustfmt::skip]
@@ -92,8 +92,8 @@ pub fn rotation_vector(q: Quat) -> [f64; 3] {
 pub fn uniform([u, v, w]: [f64; 3]) -> Quat {
     let inner = (1.0 - u).sqrt();
     let outer = u.sqrt();
-    let (sin_v, cos_v) = (std::f64::consts::TAU * v).sin_cos();
-    let (sin_w, cos_w) = (std::f64::consts::TAU * w).sin_cos();
+    let (sin_v, cos_v) = (TAU * v).sin_cos();
+    let (sin_w, cos_w) = (TAU * w).sin_cos();
     [outer * cos_w, inner * sin_v, inner * cos_v, outer * sin_w]
 }
 

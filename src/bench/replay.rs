@@ -156,11 +156,9 @@ pub fn replay(pool: &mut EnvPool<RecordingEnv>) -> Result<f64> {
             .for_each(|member| member.env.replay(step));
     });
     let seconds = start.elapsed().as_secs_f64();
-    let same = pool
-        .envs_mut()
-        .all(|env| env.bare.qpos() == env.env.sim.qpos());
+    let mut envs = pool.envs_mut();
     ensure!(
-        same,
+        envs.all(|env| env.bare.qpos() == env.env.sim.qpos()),
         "the replay of the physics did not end in the states of the environments"
     );
     Ok(seconds)

@@ -317,8 +317,10 @@ impl Ppo {
         self.adam.mean = checkpoint.take_floats("adam.mean.", &views)?;
         self.adam.square = checkpoint.take_floats("adam.square.", &views)?;
         for View { name, range, .. } in views {
-            let sound = self.adam.square[range].iter().all(|&x| x >= 0.0);
-            ensure!(sound, "tensor `adam.square.{name}` has a negative value");
+            ensure!(
+                self.adam.square[range].iter().all(|&x| x >= 0.0),
+                "tensor `adam.square.{name}` has a negative value"
+            );
         }
         let steps = checkpoint.take_counters("adam.steps")?;
         // The optimizer counts steps in 32 bits, enough for 2 · 10¹² environment steps of the default configuration.

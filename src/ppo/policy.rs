@@ -46,13 +46,11 @@ impl Policy {
     /// Creates a policy whose parameters are all zero, for environments with these spaces.
     pub fn new(config: &PpoConfig, spaces: Spaces) -> Self {
         let layout = ParameterLayout::new(&config.hidden, &spaces);
-        let parameters = vec![0.0; layout.count()];
-        let normalizer = Normalizer::new(spaces.observation_size);
         Self {
+            parameters: vec![0.0; layout.count()],
             layout,
-            parameters,
             log_std: 0.0,
-            normalizer,
+            normalizer: Normalizer::new(spaces.observation_size),
             activation: config.activation,
             spaces,
         }

@@ -61,20 +61,17 @@ impl Repose {
         let delay = task.config.action_delay + drawn_delay;
         let memory = delay.max(task.config.prediction) as usize;
         let scene = randomization.map_or(&task.scene, |randomization| &randomization.nominal);
-        let actuators = task.hand.actuators.len();
+
         Self {
             sim: Simulation::new(scene),
-            servos: Servos::new(actuators, memory),
+            servos: Servos::new(task.hand.actuators.len(), memory),
             conditions: Conditions::new(randomization),
             task: task.clone(),
             lesson: Lesson::task(&task.config),
             rng: rng::stream(0, "unused", 0),
             goal: [1.0, 0.0, 0.0, 0.0],
             last: Step {
-                action: vec![0.0; actuators],
-                previous_action: vec![0.0; actuators],
-                joint_pos: vec![0.0; task.hand.joints.len()],
-                joint_vel: vec![0.0; task.hand.joints.len()],
+                action: vec![0.0; task.hand.actuators.len()],
                 ..Step::default()
             },
             age: 0,
@@ -111,19 +108,7 @@ impl Repose {
         quat::uniform([draw(), draw(), draw()])
     }
 
-    /// Clips the action, and writes as controls the targets that take effect now.
-    fn actuate(&mut self, action: &[f32]) {
-        let last = &mut self.last;
-        std::mem::swap(&mut last.previous_action, &mut last.action);
-        last.action
-            .iter_mut()
-            .zip(action)
-            .for_each(|(clipped, action)| *clipped = action.clamp(-1.0, 1.0));
-        self.servos
-            .apply(&last.action, &self.task.hand.actuators, &self.lesson);
-        self.send();
-    }
-
+    /// Writes as controls the targets that take effect now.
     fn send(&mut self) {
         let ctrl = self.sim.ctrl_mut();
         for (actuator, target) in self.task.hand.actuators.iter().zip(&self.servos.due) {
@@ -134,7 +119,14 @@ impl Repose {
     /// Takes one step of the physics under an action, and records what its rewards depend on.
     fn advance(&mut self, action: &[f32]) {
         let rot_dist_before = self.rot_dist();
-        self.actuate(action);
+        self.last
+            .action
+            .iter_mut()
+            .zip(action)
+            .for_each(|(clipped, action)| *clipped = action.clamp(-1.0, 1.0));
+        self.servos
+            .apply(&self.last.action, &self.task.hand.actuators, &self.lesson);
+        self.send();
         self.last.push =
             self.conditions
                 .push(&self.rng, self.episode.length, &mut self.sim, &self.task);

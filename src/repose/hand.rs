@@ -107,21 +107,18 @@ impl Hand {
             "has {controls} controls, but it must have exactly the {} of the hand",
             actuators.len()
         );
-        let roots = roots(scene, &parts, &fingertips)?;
-        let start = scene.pose_of(keyframe);
-        let layout = Layout::new(joints.len(), fingertips.len(), actuators.len());
         Ok(Self {
+            roots: roots(scene, &parts, &fingertips)?,
+            start: scene.pose_of(keyframe),
+            layout: Layout::new(joints.len(), fingertips.len(), actuators.len()),
             parts,
             joints,
             actuators,
             driven,
             fingertips,
-            roots,
             object,
             goal,
             keyframe,
-            start,
-            layout,
         })
     }
 

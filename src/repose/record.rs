@@ -47,22 +47,17 @@ impl Record {
             fingertips,
             ..
         } = hand.parts.clone();
-        let ranges = hand
-            .actuators
-            .iter()
-            .map(|actuator| actuator.range)
-            .collect();
+        let ranges = hand.actuators.iter().map(|actuator| actuator.range);
         let tips = POSES
             .iter()
-            .flat_map(|fractions| tips_at(hand, scene, fractions))
-            .collect();
+            .flat_map(|fractions| tips_at(hand, scene, fractions));
         Self {
             joints,
             actuators,
-            ranges,
+            ranges: ranges.collect(),
             driven: hand.driven.clone(),
             fingertips,
-            tips,
+            tips: tips.collect(),
             symmetry,
         }
     }
@@ -82,12 +77,12 @@ impl Record {
         let actuators = record.actuators.len();
         let tips = POSES.len() * record.fingertips.len();
         let sizes = [record.ranges.len(), record.driven.len(), record.tips.len()];
-        let fits =
-            sizes == [actuators, actuators, tips] && !record.joints.is_empty() && actuators > 0;
-        let symmetry = record.symmetry.first() == Some(&0)
-            && record.symmetry.iter().all(|&rotation| rotation < 24);
         ensure!(
-            fits && symmetry,
+            sizes == [actuators, actuators, tips]
+                && !record.joints.is_empty()
+                && actuators > 0
+                && record.symmetry.first() == Some(&0)
+                && record.symmetry.iter().all(|&rotation| rotation < 24),
             "its metadata `hand` has lists of other lengths than its hand needs"
         );
         Ok(record)

@@ -4,7 +4,6 @@
 
 use crate::config::{EnvConfig, Ramp, TrainingConfig};
 use crate::quat::Quat;
-use crate::sim::{Pose, Velocity};
 
 /// A control step after its physics: what its rewards may depend on, and what they are. SI units and rad, in the world frame.
 #[derive(Clone, Debug, Default)]
@@ -23,16 +22,7 @@ pub struct Step {
     pub dropped: bool,
     /// The action, clipped to [-1, 1].
     pub action: Vec<f32>,
-    /// The action of the step before, clipped. Zeros after a reset.
-    pub previous_action: Vec<f32>,
-    /// The pose of the object.
-    pub object: Pose,
-    /// The velocity of the object's centre.
-    pub object_velocity: Velocity,
-    /// The angles of the joints, in observation order.
-    pub joint_pos: Vec<f64>,
-    /// The velocities of the joints, in observation order.
-    pub joint_vel: Vec<f64>,
+
     /// The random force on the object, if there are such forces in the episode.
     pub push: Option<[f64; 3]>,
     /// Whether the physics diverged. Then nothing above but the goal and the actions has a meaning, and there is no reward.
