@@ -290,17 +290,15 @@ fn picture(rows: &[Scored], episodes: usize, checkpoint: &str) -> BarChart {
         .filter(|row| !row.condition.is_in_grid())
         .map(|row| {
             let nominal = rows[0].score["goals"];
-            let note = format!(
-                "{:.2} goals, {:.0} % drops",
-                row.score["goals"],
-                100.0 * row.score["drop_rate"]
-            );
-            let interval = row.score.goals_ci95.map(|goals| goals / nominal);
             draw::NamedBar {
                 name: row.condition.name.clone(),
                 value: row.kept,
-                interval,
-                note,
+                interval: row.score.goals_ci95.map(|goals| goals / nominal),
+                note: format!(
+                    "{:.2} goals, {:.0} % drops",
+                    row.score["goals"],
+                    100.0 * row.score["drop_rate"]
+                ),
             }
         });
     let grid: Vec<f64> = rows

@@ -60,8 +60,10 @@ pub fn caught<T>(work: impl FnOnce() -> T) -> Result<T, String> {
 
 /// The message of a panic.
 pub fn panic_message(panic: &(dyn Any + Send)) -> &str {
-    let text = panic.downcast_ref::<String>().map(String::as_str);
-    text.or_else(|| panic.downcast_ref::<&str>().copied())
+    panic
+        .downcast_ref::<String>()
+        .map(String::as_str)
+        .or_else(|| panic.downcast_ref::<&str>().copied())
         .unwrap_or("no message")
 }
 

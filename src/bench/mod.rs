@@ -115,11 +115,10 @@ impl Bursts {
         pool.set_lesson(lesson);
         let mut rollout = Rollout::new(BURST, &pool.block_sizes(), &task.spaces());
         pool.reset(rollout.first_observations_mut());
-        let noise = rng::stream(config.run.seed, "bench", 0);
         Ok(Self {
             pool,
             rollout,
-            noise,
+            noise: rng::stream(config.run.seed, "bench", 0),
             std: config.ppo.std.at(0) as f32,
         })
     }
@@ -182,18 +181,17 @@ fn physics_and_pool(task: &Arc<Task>, config: &Config) -> Result<Found> {
             .for_each(|(rates, rate)| rates.push(rate));
     }
     let [physics, pool, share] = rates.map(median);
-    let lines = format!(
-        "physics alone (mj_step)   {physics:>10.0} steps/s\n\
-         environments              {pool:>10.0} steps/s   {:.1} % of the physics\n",
-        100.0 * share
-    );
     Ok((
         vec![
             ("physics_steps_per_s", physics),
             ("pool_steps_per_s", pool),
             ("pool_share", share),
         ],
-        lines,
+        format!(
+            "physics alone (mj_step)   {physics:>10.0} steps/s\n\
+             environments              {pool:>10.0} steps/s   {:.1} % of the physics\n",
+            100.0 * share
+        ),
     ))
 }
 

@@ -291,9 +291,8 @@ fn rows<'a>(
     rewards: &'a mut [f32],
     observations: &'a mut [f32],
 ) -> impl Iterator<Item = Row<'a>> {
-    let found = [actions.len(), rewards.len(), observations.len()];
     assert_eq!(
-        found,
+        [actions.len(), rewards.len(), observations.len()],
         [n * action_size, n, n * observation_size],
         "lengths of the actions, rewards and observations"
     );

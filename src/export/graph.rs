@@ -95,15 +95,14 @@ fn canonicalize(
     for (name, sign) in [("zero", 0.0), ("plus", 1.0), ("minus", -1.0)] {
         graph.floats(name, &[1], &[sign]);
     }
-    let parts = [
+    graph.index("axis", 1);
+    for (name, ends) in [
         ("before", [0, object]),
         ("cube", [object, object + 4]),
         ("between", [object + 4, goal]),
         ("goal", [goal, goal + 4]),
         ("after", [goal + 4, size]),
-    ];
-    graph.index("axis", 1);
-    for (name, ends) in parts {
+    ] {
         slice(graph, obs, ends, name);
     }
     graph.node("MatMul", &["cube", "cosines"], "near", &[]);

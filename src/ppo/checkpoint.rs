@@ -194,8 +194,7 @@ impl Checkpoint {
     /// # Errors
     /// Fails if a tensor is missing or of another shape.
     pub fn expect_policy(&self, config: &PpoConfig, spaces: &Spaces) -> Result<()> {
-        let layout = ParameterLayout::new(&config.hidden, spaces);
-        layout
+        ParameterLayout::new(&config.hidden, spaces)
             .views()
             .iter()
             .try_for_each(|View { name, shape, .. }| self.expect(name, shape))?;

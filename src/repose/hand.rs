@@ -132,12 +132,12 @@ impl Hand {
     /// The prefix of its names if it has the names of the Shadow Hand.
     pub fn side(&self) -> Option<&str> {
         let prefix = self.parts.joints.first()?.strip_suffix(JOINTS[0])?;
-        let names = self
-            .parts
+        self.parts
             .joints
             .iter()
-            .map(|name| name.strip_prefix(prefix));
-        names.eq(JOINTS.map(Some)).then_some(prefix)
+            .map(|name| name.strip_prefix(prefix))
+            .eq(JOINTS.map(Some))
+            .then_some(prefix)
     }
 }
 

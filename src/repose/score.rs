@@ -114,8 +114,10 @@ pub fn measure(column: &str) -> &'static Measure {
 }
 
 fn place(column: &str) -> usize {
-    let place = MEASURES.iter().position(|measure| measure.column == column);
-    place.unwrap_or_else(|| panic!("no measure is called {column}"))
+    MEASURES
+        .iter()
+        .position(|measure| measure.column == column)
+        .unwrap_or_else(|| panic!("no measure is called {column}"))
 }
 
 impl Measure {

@@ -241,14 +241,14 @@ fn add_goal(spec: &mut MjSpec, compiled: &MjModel, name: &str, goal: &str) -> Re
     let object = compiled
         .name_to_id(mjOBJ_BODY, name)
         .context("a body of the compiled scene")?;
-    let frames = frames_within(compiled, object);
+
     let shown = spec
         .world_body_mut()
         .add_body()
         .with_name(goal)
         .with_pos(compiled.body_pos()[object])
         .with_mocap(true);
-    for (geom, (mut pos, mut quat)) in geoms_within(compiled, &frames) {
+    for (geom, (mut pos, mut quat)) in geoms_within(compiled, &frames_within(compiled, object)) {
         let kind = compiled.geom_type()[geom];
         let mut mesh_name = "";
         if matches!(kind, mjGEOM_MESH | mjGEOM_SDF) {

@@ -26,8 +26,9 @@ impl SceneFiles {
     /// Fails as [`scene_files`] does.
     pub fn read(scene: &Path) -> Result<Self> {
         let read = |path: PathBuf| Some((path.to_str()?.to_owned(), read_bytes(&path).ok()?));
-        let files = scene_files(scene)?.into_iter().filter_map(read);
-        Ok(Self(files.collect()))
+        Ok(Self(
+            scene_files(scene)?.into_iter().filter_map(read).collect(),
+        ))
     }
 
     /// Whether they are the files of this scene.

@@ -218,14 +218,12 @@ fn draw_gauge(ui: &mut Ui, gauge: &Gauge) {
             ui.visuals().widgets.noninteractive.fg_stroke,
         );
     }
-    let colour = ui.visuals().strong_text_color();
-    let at = rect.right_center() - vec2(4.0, 0.0);
     painter.text(
-        at,
+        rect.right_center() - vec2(4.0, 0.0),
         Align2::RIGHT_CENTER,
         &gauge.text,
         FontId::monospace(12.0),
-        colour,
+        ui.visuals().strong_text_color(),
     );
 }
 
@@ -249,10 +247,10 @@ impl egui::Plugin for CloseLeftPanel {
         };
         let edge = pos2(panel.outer_rect.right(), panel.outer_rect.center().y);
         let side = pos2(panel.outer_rect.left() - 50.0, edge.y);
-        let button = egui::PointerButton::Primary;
+
         let press = |pos, pressed| Event::PointerButton {
             pos,
-            button,
+            button: egui::PointerButton::Primary,
             pressed,
             modifiers: egui::Modifiers::NONE,
         };

@@ -88,7 +88,7 @@ impl Scene {
     /// # Errors
     /// Fails with the file's name and MuJoCo's own message if MuJoCo refuses the scene.
     pub fn load(file: Option<&Path>, compilation: &Compilation) -> Result<Self> {
-        let compiled = compilation.compile(file).and_then(|model| {
+        let checked = |model| {
             // The built-in scene is known to be finite.
             if file.is_some()
                 && let Some(culprit) = not_finite(&model)?
@@ -96,8 +96,11 @@ impl Scene {
                 bail!("{culprit} is not a finite number");
             }
             Self::checked(model, compilation)
-        });
-        compiled.with_context(|| origin(file))
+        };
+        compilation
+            .compile(file)
+            .and_then(checked)
+            .with_context(|| origin(file))
     }
 
     /// Loads the same scene, with the same physics, and with what is needed for display.
@@ -207,12 +210,12 @@ impl Scene {
             .free_joint(body.0)
             .with_context(|| format!("body `{}` must have a free joint", shortened(name)))?;
         let dof = self.model.jnt_dofadr()[joint] as usize;
-        let inertia = self.model.dof_m0()[dof + 3..dof + 6].iter().sum::<f64>() / 3.0;
+
         Ok(FreeJoint {
             body,
             qpos: self.model.jnt_qposadr()[joint] as usize,
             dof,
-            inertia,
+            inertia: self.model.dof_m0()[dof + 3..dof + 6].iter().sum::<f64>() / 3.0,
         })
     }
 
@@ -303,8 +306,6 @@ impl Scene {
         let model = &self.model;
         let group = model.actuator_group()[id];
         let is_disabled = (0..31).contains(&group) && model.opt().disableactuator >> group & 1 == 1;
-        let moves = matches!(model.actuator_trntype()[id], mjTRN_JOINT | mjTRN_TENDON);
-        let is_angle = model.actuator_gear()[id][0] == 1.0;
         let is_direct =
             model.actuator_dyntype()[id] == mjDYN_NONE && model.actuator_delay()[id] == 0.0;
         let ctrl = model.actuator_ctrladr()[id] as usize;
@@ -324,8 +325,14 @@ impl Scene {
                 !is_disabled,
                 &format!("not be disabled by its group {group}"),
             ),
-            (moves, "drive a joint or a tendon"),
-            (is_angle, "have a gear of 1: its control is an angle"),
+            (
+                matches!(model.actuator_trntype()[id], mjTRN_JOINT | mjTRN_TENDON),
+                "drive a joint or a tendon",
+            ),
+            (
+                model.actuator_gear()[id][0] == 1.0,
+                "have a gear of 1: its control is an angle",
+            ),
             (
                 is_direct,
                 "act at once: without activation dynamics (timeconst) and delay",

@@ -35,15 +35,15 @@ impl Viewer {
         };
         let mut viewer =
             attempt(build).map_err(|reason| anyhow!("cannot open a window: {reason}{HELP}"))?;
-        let controls = Controls {
-            speed: 1.0,
-            choice: first,
-            ..Controls::default()
-        };
+
         let panel = Rc::new(RefCell::new(Panel {
             choices,
             readout: Readout::default(),
-            controls,
+            controls: Controls {
+                speed: 1.0,
+                choice: first,
+                ..Controls::default()
+            },
         }));
         let shown = panel.clone();
         viewer.add_ui_callback(move |ui, _| shown.borrow_mut().show(ui));

@@ -65,19 +65,20 @@ fn multiplies_rightly(unit: &dyn Unit) -> bool {
     let a = numbers(rows * depth, 5);
     let b = numbers(depth * columns, 3);
     let b = Matrix::new(&b, depth, columns);
-    let by_rows = Matrix::new(&a, rows, depth);
-    let by_columns = Matrix::new(&a, depth, rows).transposed();
-    [by_rows, by_columns].into_iter().all(|a| {
-        let mut lhs = Packed::default();
-        let mut rhs = Packed::default();
-        lhs.pack(a, unit.order_of_left(a));
-        rhs.pack(b.transposed(), Order::Pairs);
-        let mut out = vec![1.0; rows * columns];
-        let mut expected = out.clone();
-        unit.product(&mut out, columns, [&lhs, &rhs], true);
-        product(&mut expected, a, b, true);
-        out == expected
-    })
+    let of_columns = Matrix::new(&a, depth, rows).transposed();
+    [Matrix::new(&a, rows, depth), of_columns]
+        .into_iter()
+        .all(|a| {
+            let mut lhs = Packed::default();
+            let mut rhs = Packed::default();
+            lhs.pack(a, unit.order_of_left(a));
+            rhs.pack(b.transposed(), Order::Pairs);
+            let mut out = vec![1.0; rows * columns];
+            let mut expected = out.clone();
+            unit.product(&mut out, columns, [&lhs, &rhs], true);
+            product(&mut expected, a, b, true);
+            out == expected
+        })
 }
 
 #[cfg(test)]
