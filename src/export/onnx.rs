@@ -103,13 +103,9 @@ impl Graph {
 
 /// Describes a value `[batch, size]` of floats.
 fn rows_of((name, size): (&str, usize)) -> Message {
-    let dimensions = [
-        Message::default().text(2, "batch"),
-        Message::default().int(1, size as i64),
-    ];
-    let shape = dimensions
-        .iter()
-        .fold(Message::default(), |shape, size| shape.message(1, size));
+    let shape = Message::default()
+        .message(1, &Message::default().text(2, "batch"))
+        .message(1, &Message::default().int(1, size as i64));
     let kind = Message::default().message(1, &Message::default().int(1, FLOAT).message(2, &shape));
     Message::default().text(1, name).message(2, &kind)
 }

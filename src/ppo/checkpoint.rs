@@ -105,12 +105,9 @@ impl Checkpoint {
             .provenance
             .iter()
             .map(|text| ("provenance", text.as_str()));
-        let texts = always
-            .into_iter()
-            .chain(provenance)
-            .map(|(key, text)| (key.into(), text.into()))
-            .collect();
-        format::to_bytes(texts, &self.arrays)
+        let texts = always.into_iter().chain(provenance);
+        let texts = texts.map(|(key, text)| (key.into(), text.into()));
+        format::to_bytes(texts.collect(), &self.arrays)
     }
 
     /// Only the parts that playing needs. The path of a fork's checkpoint is left out. The path of an own scene stays in the
@@ -274,8 +271,11 @@ impl Ppo {
     pub fn save(&self, checkpoint: &mut Checkpoint) {
         let vector = |values: &[f64]| Array::F64(vec![values.len()], values.to_vec());
         let adam = &self.adam;
-        let [mean, square] =
-            [&adam.mean, &adam.square].map(|moment| self.slices.all_gathered(moment));
+        let [mean, square] = [&adam.mean, &adam.square].map(|own| {
+            let mut moment = own.clone();
+            self.slices.all_gather(&mut moment);
+            moment
+        });
         let kinds = [
             ("", &self.policy.parameters[..]),
             ("adam.mean.", &mean),
@@ -321,13 +321,11 @@ impl Ppo {
                 "tensor `adam.square.{name}` has a negative value"
             );
         }
-        let steps = checkpoint.take_counters("adam.steps")?;
         // The optimizer counts steps in 32 bits, enough for 2 · 10¹² environment steps of the default configuration.
-        ensure!(
-            steps.len() == 1 && steps[0] <= i32::MAX as u64,
-            "tensor `adam.steps` is not a step count"
-        );
-        self.adam.steps = steps[0];
+        match checkpoint.take_counters("adam.steps")?[..] {
+            [steps] if steps <= i32::MAX as u64 => self.adam.steps = steps,
+            _ => bail!("tensor `adam.steps` is not a step count"),
+        }
         self.learning_rate = checkpoint.take_vector("learning_rate", 1)?[0];
         ensure!(
             self.learning_rate > 0.0,

@@ -159,21 +159,16 @@ impl Policy {
         let width = frozen.nets[net].outputs();
         let rows = observations.len() / size;
         let mut results = vec![0.0; rows.next_multiple_of(GROUP) * width];
-        let group = |(seen, results): (&[f32], &mut [f32])| {
-            let mut padded = seen.to_vec();
-            padded.resize(GROUP * size, 0.0);
-            let mut outputs = [Default::default(), Default::default()];
-            outputs[net] = results;
-            frozen.compute(&padded, outputs, &mut frozen.workspace(GROUP));
-        };
-        if rows <= GROUP {
-            group((observations, &mut results));
-        } else {
-            observations
-                .par_chunks(GROUP * size)
-                .zip(results.par_chunks_mut(GROUP * width))
-                .for_each(group);
-        }
+        observations
+            .par_chunks(GROUP * size)
+            .zip(results.par_chunks_mut(GROUP * width))
+            .for_each(|(seen, results)| {
+                let mut padded = seen.to_vec();
+                padded.resize(GROUP * size, 0.0);
+                let mut outputs = [Default::default(), Default::default()];
+                outputs[net] = results;
+                frozen.compute(&padded, outputs, &mut frozen.workspace(GROUP));
+            });
         results.truncate(rows * width);
         results
     }

@@ -211,10 +211,12 @@ impl Ppo {
             );
         }
         if let Stage::Later = stage {
-            let range = self.config.learning_rate_range;
-            let desired_kl = self.config.desired_kl.at(self.env_steps);
-            self.learning_rate =
-                learning_rate::adapted(self.learning_rate, losses.kl, desired_kl, range);
+            self.learning_rate = learning_rate::adapted(
+                self.learning_rate,
+                losses.kl,
+                self.config.desired_kl.at(self.env_steps),
+                self.config.learning_rate_range,
+            );
         }
         // As in PyTorch's clip_grad_norm_, including the constant that prevents a division by zero.
         let scale = (self.config.max_grad_norm / (grad_norm + 1e-6)).min(1.0);

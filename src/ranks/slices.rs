@@ -82,13 +82,6 @@ impl Slices {
     pub fn all_gather(&self, numbers: &mut [f32]) {
         self.exchange.all_gather_slices(numbers, &self.all);
     }
-
-    /// The values with the slices of all ranks.
-    pub fn all_gathered(&self, numbers: &[f32]) -> Vec<f32> {
-        let mut all = numbers.to_vec();
-        self.all_gather(&mut all);
-        all
-    }
 }
 
 /// Splits numbers into the chunks, which follow one another.

@@ -148,7 +148,7 @@ fn shadow_hand(scene: &Scene) -> Option<Parts> {
 
     let with =
         |names: &[&str], prefix: &str| names.iter().map(|name| format!("{prefix}{name}")).collect();
-    let mut hands = joints
+    joints
         .iter()
         .filter_map(|name| name.strip_suffix(JOINTS[0]))
         .map(|prefix| Parts {
@@ -156,12 +156,12 @@ fn shadow_hand(scene: &Scene) -> Option<Parts> {
             actuators: with(&ACTUATORS, &format!("{prefix}A_")),
             fingertips: with(&FINGERTIPS, prefix),
             ..Parts::default()
-        });
-    hands.find(|hand| {
-        hand.joints.iter().all(|name| joints.contains(name))
-            && hand.actuators.iter().all(|name| actuators.contains(name))
-            && hand.fingertips.iter().all(|name| scene.body(name).is_ok())
-    })
+        })
+        .find(|hand| {
+            hand.joints.iter().all(|name| joints.contains(name))
+                && hand.actuators.iter().all(|name| actuators.contains(name))
+                && hand.fingertips.iter().all(|name| scene.body(name).is_ok())
+        })
 }
 
 /// The first bodies of the trees that carry these fingertips.

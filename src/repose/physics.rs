@@ -252,11 +252,10 @@ pub fn physical(config: &EnvConfig) -> Table {
 /// Adds to a JSON object the settings of a task that vary its physics, what is observed, and when actions take effect.
 pub fn add_settings(config: &EnvConfig, object: &mut Value) {
     let table = Table::try_from(config).expect("settings are a table");
-    let names = QUANTITIES
-        .iter()
-        .map(|quantity| quantity.setting)
-        .chain(OTHERS);
-    names.for_each(|name| object[name] = json!(table[name]));
+    let settings = QUANTITIES.iter().map(|quantity| quantity.setting);
+    for name in settings.chain(OTHERS) {
+        object[name] = json!(table[name]);
+    }
 }
 
 #[cfg(test)]

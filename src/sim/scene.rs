@@ -227,9 +227,13 @@ impl Scene {
 
     /// The names of its keyframes.
     pub fn keyframes(&self) -> Vec<String> {
-        let name = |id| self.model.id_to_name(mjOBJ_KEY, id).unwrap_or_default();
         ids(self.model.nkey())
-            .map(|id| name(id).to_owned())
+            .map(|id| {
+                self.model
+                    .id_to_name(mjOBJ_KEY, id)
+                    .unwrap_or_default()
+                    .to_owned()
+            })
             .collect()
     }
 

@@ -202,35 +202,29 @@ impl Scene {
     /// The joints that an actuator drives, with the coefficients of their sum, which is its length. A tendon along a path
     /// in space drives no sum.
     pub fn driven(&self, actuator: Actuator) -> Vec<(String, f64)> {
-        let name = |joint: usize| {
-            self.model
-                .id_to_name(mjOBJ_JOINT, joint)
-                .unwrap_or_default()
-                .to_owned()
-        };
-        self.wraps(actuator.id)
-            .into_iter()
-            .filter(|(kind, ..)| *kind == mjWRAP_JOINT)
-            .map(|(_, joint, coefficient)| (name(joint), coefficient))
-            .collect()
+        let mut driven = Vec::new();
+        for (kind, id, coefficient) in self.wraps(actuator.id) {
+            if kind == mjWRAP_JOINT {
+                let name = self.model.id_to_name(mjOBJ_JOINT, id).unwrap_or_default();
+                driven.push((name.to_owned(), coefficient));
+            }
+        }
+        driven
     }
 
     /// What an actuator or its tendon acts on: the kind, the number, and the coefficient if it is a joint.
     fn wraps(&self, actuator: usize) -> Vec<(MjtWrap, usize, f64)> {
         let target = self.model.actuator_trnid()[actuator][0] as usize;
-        let wrap = |at: usize| {
-            (
-                self.model.wrap_type()[at],
-                self.model.wrap_objid()[at] as usize,
-                self.model.wrap_prm()[at],
-            )
-        };
-        match self.model.actuator_trntype()[actuator] {
+        let model = &self.model;
+        match model.actuator_trntype()[actuator] {
             mjTRN_JOINT => vec![(mjWRAP_JOINT, target, 1.0)],
             mjTRN_TENDON => {
-                let first = self.model.tendon_adr()[target] as usize;
-                (first..first + self.model.tendon_num()[target] as usize)
-                    .map(wrap)
+                let first = model.tendon_adr()[target] as usize;
+                (first..first + model.tendon_num()[target] as usize)
+                    .map(|at| {
+                        let id = model.wrap_objid()[at] as usize;
+                        (model.wrap_type()[at], id, model.wrap_prm()[at])
+                    })
                     .collect()
             }
             _ => Vec::new(),
