@@ -476,7 +476,6 @@ mod tests {
             }
             let ppo = Ppo::new(&config.ppo, spaces, 0, Exchange::alone(1)).unwrap();
             let actor = Actor::Mean(ppo.policy.freeze());
-
             // Cube and goal coincide: once unrotated, once both rotated by half a turn about their own x axis.
             let Spaces {
                 observation_size: size,

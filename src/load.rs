@@ -186,17 +186,16 @@ impl Loaded {
         let record = Record::parse(&checkpoint.hand)?;
         let policy = Policy::load(&config.ppo, record.spaces(), &checkpoint)
             .with_context(|| format!("cannot use the policy {origin}"))?;
-        let name = match &origin {
-            PolicySource::BuiltIn(policy) => policy.title.to_owned(),
-            PolicySource::File(path) => format!(
-                "{}, {} control steps",
-                path.display(),
-                checkpoint.progress.env_steps
-            ),
-        };
         Ok(Self {
+            name: match &origin {
+                PolicySource::BuiltIn(policy) => policy.title.to_owned(),
+                PolicySource::File(path) => format!(
+                    "{}, {} control steps",
+                    path.display(),
+                    checkpoint.progress.env_steps
+                ),
+            },
             origin,
-            name,
             record,
             policy,
             checkpoint,

@@ -115,18 +115,14 @@ impl<E: Env> Agent<E> {
         let mut pool = EnvPool::new(seed, envs, &exchange);
         let ppo = Ppo::new(config, pool.spaces(), seed, exchange.clone())?;
         let mut rollout = ppo.rollout(&pool.block_sizes());
-        let work = pool
-            .block_sizes()
-            .into_iter()
-            .map(|envs| ppo.workspace(envs))
-            .collect();
         pool.set_lesson(lessons(0));
         pool.reset(rollout.first_observations_mut());
+        let sizes = pool.block_sizes().into_iter();
         Ok(Self {
+            work: sizes.map(|envs| ppo.workspace(envs)).collect(),
             pool,
             ppo,
             rollout,
-            work,
             lessons: Box::new(lessons),
             iteration: 0,
             env_steps: 0,

@@ -80,7 +80,6 @@ impl<E: Env> EnvPool<E> {
         );
         let all = in_shard * exchange.shards;
         let sizes = block_sizes(in_shard, all);
-        let first_block = shards.start * sizes.len();
         let members = (shards.start * in_shard..).zip(envs);
         let mut members = members.map(|(number, env)| Member {
             env,
@@ -91,7 +90,7 @@ impl<E: Env> EnvPool<E> {
             next_episode: number as u64,
             stride: all as u64,
         });
-        let blocks = (first_block..).zip(sizes.repeat(shards.len()));
+        let blocks = (shards.start * sizes.len()..).zip(sizes.repeat(shards.len()));
         let blocks = blocks.map(|(number, size)| EnvBlock {
             number,
             members: members.by_ref().take(size).collect(),

@@ -61,7 +61,6 @@ impl Repose {
         let delay = task.config.action_delay + drawn_delay;
         let memory = delay.max(task.config.prediction) as usize;
         let scene = randomization.map_or(&task.scene, |randomization| &randomization.nominal);
-
         Self {
             sim: Simulation::new(scene),
             servos: Servos::new(task.hand.actuators.len(), memory),

@@ -22,7 +22,6 @@ pub struct Step {
     pub dropped: bool,
     /// The action, clipped to [-1, 1].
     pub action: Vec<f32>,
-
     /// The random force on the object, if there are such forces in the episode.
     pub push: Option<[f64; 3]>,
     /// Whether the physics diverged. Then nothing above but the goal and the actions has a meaning, and there is no reward.

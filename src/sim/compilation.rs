@@ -241,7 +241,6 @@ fn add_goal(spec: &mut MjSpec, compiled: &MjModel, name: &str, goal: &str) -> Re
     let object = compiled
         .name_to_id(mjOBJ_BODY, name)
         .context("a body of the compiled scene")?;
-
     let shown = spec
         .world_body_mut()
         .add_body()

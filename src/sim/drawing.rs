@@ -54,14 +54,13 @@ impl Scene {
             mjJNT_BALL => Some(model.jnt_qposadr()[joint] as usize),
             _ => None,
         });
-        let quaternions = of_joints
-            .chain((positions + 3..start.len()).step_by(7))
-            .collect();
         Drawing {
+            quaternions: of_joints
+                .chain((positions + 3..start.len()).step_by(7))
+                .collect(),
             scene,
             start,
             positions,
-            quaternions,
             meshes,
         }
     }

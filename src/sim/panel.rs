@@ -247,7 +247,6 @@ impl egui::Plugin for CloseLeftPanel {
         };
         let edge = pos2(panel.outer_rect.right(), panel.outer_rect.center().y);
         let side = pos2(panel.outer_rect.left() - 50.0, edge.y);
-
         let press = |pos, pressed| Event::PointerButton {
             pos,
             button: egui::PointerButton::Primary,

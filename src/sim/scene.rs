@@ -210,7 +210,6 @@ impl Scene {
             .free_joint(body.0)
             .with_context(|| format!("body `{}` must have a free joint", shortened(name)))?;
         let dof = self.model.jnt_dofadr()[joint] as usize;
-
         Ok(FreeJoint {
             body,
             qpos: self.model.jnt_qposadr()[joint] as usize,

@@ -35,7 +35,6 @@ impl Viewer {
         };
         let mut viewer =
             attempt(build).map_err(|reason| anyhow!("cannot open a window: {reason}{HELP}"))?;
-
         let panel = Rc::new(RefCell::new(Panel {
             choices,
             readout: Readout::default(),
