@@ -133,15 +133,9 @@ fn played(
     episodes: Episodes,
     requests: &Requests,
 ) -> Result<Vec<Scored>> {
-    let is_known = |i: usize, task: &Task| {
-        playable[..i]
-            .iter()
-            .any(|(_, other)| other.config == task.config)
-    };
-    let different = playable
-        .iter()
-        .enumerate()
-        .filter(|(i, (_, task))| !is_known(*i, task))
+    let configs: Vec<_> = playable.iter().map(|(_, task)| &task.config).collect();
+    let different = (0..configs.len())
+        .filter(|&i| !configs[..i].contains(&configs[i]))
         .count();
     let bar = os::progress_bar(
         (different * episodes.count) as u64,
@@ -235,7 +229,7 @@ fn mean_kept(rows: &[Scored]) -> f64 {
 }
 
 fn as_json(rows: &[Scored], episodes: usize, seed: u64, checkpoint: &str) -> Value {
-    let of_row = |row: &Scored| {
+    let list = rows.iter().map(|row| {
         let value = |set: &Override| {
             let value: toml::Value = set.value.parse().expect("the values are TOML");
             (set.key.clone(), json!(value))
@@ -248,10 +242,10 @@ fn as_json(rows: &[Scored], episodes: usize, seed: u64, checkpoint: &str) -> Val
             measure("drop_rate").key: row.score["drop_rate"],
             "kept": row.kept,
         })
-    };
-    let list: Vec<Value> = rows.iter().map(of_row).collect();
+    });
     json!({
-        "episodes": episodes, "seed": seed, "checkpoint": checkpoint, "rows": list, "mean_kept": mean_kept(rows),
+        "episodes": episodes, "seed": seed, "checkpoint": checkpoint, "rows": list.collect::<Value>(),
+        "mean_kept": mean_kept(rows),
     })
 }
 

@@ -73,8 +73,7 @@ impl Policy {
             .enumerate()
         {
             let bound = 1.0 / (layer.inputs as f32).sqrt();
-            let is_last_of_actor = i + 1 == policy.layout.actor.len();
-            let of_weights = if is_last_of_actor {
+            let of_weights = if i + 1 == policy.layout.actor.len() {
                 bound * LAST_ACTOR_LAYER
             } else {
                 bound

@@ -100,11 +100,13 @@ impl Conditions {
     /// Adds sensor noise for step `steps` and the constant offset of the episode that owns `rng`.
     pub fn disturb(&self, rng: &Rng, steps: u32, task: &Task, observation: &mut [f32]) {
         let drawn = self.randomization.as_ref().zip(self.draw.as_ref());
-        let of_draw = drawn.and_then(|(randomization, draw)| randomization.noise(draw));
+        let of_draw = drawn
+            .filter(|(_, draw)| draw.has_noise)
+            .map(|(randomization, _)| &randomization.noise);
         let noises = [Some(&task.noise), of_draw]
             .into_iter()
             .flatten()
-            .filter(|spread| !spread.is_empty());
+            .filter(|spread| !spread.0.is_empty());
         let mut noise_rng = None;
         for noise in noises {
             let rng = noise_rng.get_or_insert_with(|| rng::beside_at(rng, "noise", steps));

@@ -187,12 +187,6 @@ impl Repose {
         // The target may affect the physics of a custom scene, so nothing may depend on its old pose.
         self.sim.refresh();
     }
-
-    /// Decides whether the lesson replaces a goal that was not reached. The decision is random, so the state needs no clock.
-    fn gives_up(&mut self) -> bool {
-        let chance = self.lesson.redirect_chance;
-        chance > 0.0 && rng::uniform(&mut self.rng, 0.0, 1.0) < chance
-    }
 }
 
 impl Env for Repose {
@@ -283,10 +277,12 @@ impl Env for Repose {
             Some(End::Terminated)
         } else {
             let time_is_up = self.age >= self.task.config.max_episode_steps();
+            let chance = self.lesson.redirect_chance;
             let goal_ends = if reached {
                 self.lesson.goals_end
             } else {
-                self.gives_up()
+                // A goal that was not reached is given up at random, so the state needs no clock.
+                chance > 0.0 && rng::uniform(&mut self.rng, 0.0, 1.0) < chance
             };
             time_is_up
                 .then_some(End::Truncated)

@@ -21,11 +21,6 @@ pub struct Mirror {
     tips: Vec<(usize, Quat)>,
 }
 
-/// The mirrored rotation: its axis is mirrored like a point, and its sense is the opposite one.
-fn mirrored([w, x, y, z]: Quat) -> Quat {
-    [w, -x, y, -z]
-}
-
 impl Mirror {
     /// The mirror from the hand of `here` to the hand of `policy`.
     ///
@@ -35,10 +30,12 @@ impl Mirror {
         // Returns how far a fingertip is from its counterpart on the other hand in a recorded pose, and the rotation
         // between the two.
         let compare = |at: usize| {
-            let [x, y, z, own @ ..] = here.tips[at];
+            let [x, y, z, qw, qx, qy, qz] = here.tips[at];
             let [a, b, c, other @ ..] = policy.tips[at];
             let apart = [x - a, y + b, z - c].map(f64::abs);
-            let between = quat::mul(quat::conj(mirrored(own)), other);
+            // The axis of a mirrored rotation is mirrored like a point, and its sense is the opposite one.
+            let mirrored = [qw, -qx, qy, -qz];
+            let between = quat::mul(quat::conj(mirrored), other);
             (apart.into_iter().fold(0.0, f64::max), between)
         };
         let mut tips = Vec::new();

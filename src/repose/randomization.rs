@@ -20,9 +20,9 @@ pub struct Randomization {
     pub(super) config: RandomizationConfig,
     /// The scene of the episodes that are not randomised. It has the physics of the task.
     pub nominal: Scene,
-    /// The scenes with another size of the object, each behind the factor on its lengths. The last one is the nominal scene.
+    /// The scenes with another size of the object, each behind the factor on its lengths. The first one is the nominal scene.
     scenes: Vec<(f64, Scene)>,
-    noise: NoiseStd,
+    pub(super) noise: NoiseStd,
     pub(super) bias: NoiseStd,
 }
 
@@ -128,11 +128,6 @@ impl Randomization {
             .find(|(size, _)| physics["cube_size"] == [*size]);
         let (_, scene) = sized.expect("a size that can be drawn, or the nominal one");
         (scene, physics.changes(hand))
-    }
-
-    /// The noise on the observations of an episode, if there is any.
-    pub(super) fn noise(&self, draw: &EpisodePhysics) -> Option<&NoiseStd> {
-        Some(&self.noise).filter(|_| draw.has_noise)
     }
 
     /// The force on the object, N, in a step (from 0) of the episode of `rng`, or `None` if it has none.

@@ -157,20 +157,22 @@ impl Record {
     pub(super) fn warning(&self, there: &Self) -> Option<String> {
         // In whatever order a tendon has its joints.
         let sum = |of: &Self, i: usize| -> BTreeSet<_> {
-            let place = |name: &String| of.joints.iter().position(|joint| joint == name);
             let driven = of.driven[i].iter();
             driven
-                .map(|(name, coefficient)| (place(name), coefficient.to_bits()))
+                .map(|(name, coefficient)| {
+                    let place = of.joints.iter().position(|joint| joint == name);
+                    (place, coefficient.to_bits())
+                })
                 .collect()
         };
-        let apart = |i: &usize| {
-            let mut ends = self.ranges[*i].iter().zip(there.ranges[*i]);
-            ends.any(|(own, found)| (own - found).abs() > 1e-4) || sum(self, *i) != sum(there, *i)
-        };
-        let others: Vec<&str> = (0..self.ranges.len())
-            .filter(apart)
-            .map(|i| &*there.actuators[i])
-            .collect();
+        let mut others = Vec::new();
+        for (i, name) in there.actuators.iter().enumerate() {
+            let mut ends = self.ranges[i].iter().zip(there.ranges[i]);
+            if ends.any(|(own, found)| (own - found).abs() > 1e-4) || sum(self, i) != sum(there, i)
+            {
+                others.push(name.as_str());
+            }
+        }
         (!others.is_empty()).then(|| {
             let names = shortened(&others.join(" "));
             format!("an action means another angle than in training: the ranges or the tendons of {names} differ")

@@ -13,7 +13,7 @@ use crate::rng::Rng;
 
 /// The standard deviations of what is added to each value of an observation, by index, where they are not 0.
 #[derive(Clone, Debug)]
-pub struct NoiseStd(Vec<(usize, f32)>);
+pub struct NoiseStd(pub Vec<(usize, f32)>);
 
 impl NoiseStd {
     /// Spreads the values of groups over the values of an observation.
@@ -45,11 +45,6 @@ impl NoiseStd {
             }
         }
         Ok(Self(all))
-    }
-
-    /// Whether nothing is added to any value.
-    pub fn is_empty(&self) -> bool {
-        self.0.is_empty()
     }
 
     /// Draws what is added: independent normal numbers.

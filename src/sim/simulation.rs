@@ -114,17 +114,16 @@ impl Simulation {
         let ties: Vec<_> = ids(model.neq())
             .filter(|&i| model.eq_type()[i] == mjEQ_JOINT && model.eq_active0()[i])
             .collect();
-        let from_reference = |qpos: &[f64], joint: i32| {
-            let place = *model.jnt_qposadr().get(joint as usize)? as usize;
-            Some(qpos[place] - model.qpos0()[place])
-        };
         // A joint may follow one that follows.
         (0..=ties.len()).any(|_| {
             let mut apart: f64 = 0.0;
             for &tie in &ties {
                 let qpos = self.qpos_mut();
                 // Without a second joint, the first is held where it is.
-                let other = from_reference(qpos, model.eq_obj2id()[tie]).unwrap_or(0.0);
+                let other = model
+                    .jnt_qposadr()
+                    .get(model.eq_obj2id()[tie] as usize)
+                    .map_or(0.0, |&at| qpos[at as usize] - model.qpos0()[at as usize]);
                 let wanted = model.eq_data()[tie][..5]
                     .iter()
                     .rfold(0.0, |sum, factor| sum * other + factor);
