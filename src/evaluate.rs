@@ -201,14 +201,12 @@ impl Trial<'_> {
     /// # Errors
     /// Fails with the episode's number if an episode panics.
     pub fn score(&self, bar: &Bar, observe: &mut dyn FnMut(&Moment)) -> Result<Option<Score>> {
-        let mut observer = |moment: Moment| {
+        let played = self.play(&mut |moment| {
             observe(&moment);
             bar.inc(moment.ends().into());
             Ok(())
-        };
-        Ok(self
-            .play(&mut observer)?
-            .map(|played| Score::of(&played, self.task.config.ctrl_dt)))
+        })?;
+        Ok(played.map(|played| Score::of(&played, self.task.config.ctrl_dt)))
     }
 
     /// Plays the episodes that `exchange` assigns to this rank, seen by the observer. Returns the episodes of all ranks in order,

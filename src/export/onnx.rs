@@ -93,10 +93,11 @@ impl Graph {
             .text(3, env!("CARGO_PKG_VERSION"))
             .message(7, &self.0)
             .message(8, &Message::default().text(1, "").int(2, OPSET));
-        let entry = |(key, value): &(&str, String)| Message::default().text(1, key).text(2, value);
         metadata
             .iter()
-            .fold(model, |model, text| model.message(14, &entry(text)))
+            .fold(model, |model, (key, value)| {
+                model.message(14, &Message::default().text(1, key).text(2, value))
+            })
             .0
     }
 }

@@ -69,12 +69,12 @@ impl Rollout {
             }
         };
         let blocks: Vec<_> = block_sizes.iter().map(block).collect();
-        let rows = |(i, block): (usize, &RolloutBlock)| {
-            (0..block.samples() as u32).map(move |row| (i as u32, row))
-        };
+        let numbered = blocks.iter().enumerate();
         Self {
             horizon,
-            places: blocks.iter().enumerate().flat_map(rows).collect(),
+            places: numbered
+                .flat_map(|(i, block)| (0..block.samples() as u32).map(move |row| (i as u32, row)))
+                .collect(),
             blocks,
         }
     }

@@ -2,7 +2,7 @@
 
 use std::f64::consts::{E, TAU};
 use std::iter::repeat_n;
-use std::ops::{Add, Range};
+use std::ops::Add;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use anyhow::{Context, Result, ensure};
@@ -157,14 +157,14 @@ impl Ppo {
     /// The mean and variance of one array over all samples of the update.
     fn mean_and_variance(&self, rollout: &Rollout, of: fn(&RolloutBlock) -> &[f32]) -> (f64, f64) {
         let sum = |term: &(dyn Fn(f64) -> f64 + Sync)| {
-            let of_blocks = |blocks: &[RolloutBlock]| {
-                blocks
-                    .iter()
-                    .flat_map(of)
-                    .map(|&x| term(f64::from(x)))
-                    .sum()
-            };
-            self.exchange.sum(&rollout.blocks, of_blocks, f64::add)
+            self.exchange.sum(
+                &rollout.blocks,
+                |blocks| {
+                    let values = blocks.iter().flat_map(of);
+                    values.map(|&x| term(f64::from(x))).sum()
+                },
+                f64::add,
+            )
         };
         let count = self.exchange.of_all(rollout.samples()) as f64;
         let mean = sum(&|x| x) / count;
@@ -192,13 +192,14 @@ impl Ppo {
             count,
             &mut self.of_groups,
         )?;
-        let add_up = |parameters: Range<usize>, out: &mut [f32]| match stage {
-            Stage::CriticAlone if parameters.start < nets[0].end => out.fill(0.0),
-            _ => tree_sum(out, &self.of_groups, parameters),
-        };
-        let squares = self
-            .slices
-            .reduce_scatter(&mut self.gradient, add_up, sum_of_squares);
+        let squares = self.slices.reduce_scatter(
+            &mut self.gradient,
+            |parameters, out| match stage {
+                Stage::CriticAlone if parameters.start < nets[0].end => out.fill(0.0),
+                _ => tree_sum(out, &self.of_groups, parameters),
+            },
+            sum_of_squares,
+        );
         let grad_norm = norm(&squares, &nets);
         let losses = self.losses(&sums, count);
         for (what, value) in [

@@ -51,9 +51,10 @@ impl Exchange {
         while groups > 1 && in_shard / groups < SMALLEST_GROUP {
             groups /= 2;
         }
-        let split =
-            |shard: &'a [u32]| (0..groups).map(move |group| &shard[part(in_shard, group, groups)]);
-        samples.chunks(in_shard).flat_map(split).collect()
+        samples
+            .chunks(in_shard)
+            .flat_map(|shard| (0..groups).map(move |group| &shard[part(in_shard, group, groups)]))
+            .collect()
     }
 }
 

@@ -51,11 +51,12 @@ impl Slices {
     ) -> Vec<f64> {
         let parts = split(numbers, &self.chunks).into_par_iter();
         if self.exchange.is_alone() {
-            let sum_and_of = |(chunk, out): (_, &mut [f32])| {
-                sum(chunk, out);
-                of(out)
-            };
-            return parts.map(sum_and_of).collect();
+            return parts
+                .map(|(chunk, out)| {
+                    sum(chunk, out);
+                    of(out)
+                })
+                .collect();
         }
         parts.for_each(|(chunk, out)| sum(chunk, out));
         let parts = self.exchange.all_to_all(numbers, &self.all);

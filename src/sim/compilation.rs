@@ -143,9 +143,9 @@ impl Compilation {
             .map_err(refused)?;
         // The wrapper returns names as text, whatever their bytes are.
         let names: Vec<u8> = model.names().iter().map(|&byte| byte as u8).collect();
-        let is_name = |name: &[u8]| name.len() <= LONGEST_NAME && str::from_utf8(name).is_ok();
+        let mut names = names.split(|&byte| byte == 0);
         ensure!(
-            names.split(|&byte| byte == 0).all(is_name),
+            names.all(|name| name.len() <= LONGEST_NAME && str::from_utf8(name).is_ok()),
             "a name in it is not UTF-8, or has more than {LONGEST_NAME} bytes"
         );
         Ok(model)
