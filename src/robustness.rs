@@ -218,11 +218,10 @@ fn conditions() -> Vec<Condition> {
 
 /// The mean fraction of goals over the single changes, each counted as at most 1.
 fn mean_kept(rows: &[Scored]) -> f64 {
-    let single = rows
+    let kept: Vec<f64> = rows
         .iter()
         .skip(1)
-        .filter(|row| !row.condition.is_in_grid());
-    let kept: Vec<f64> = single
+        .filter(|row| !row.condition.is_in_grid())
         .map(|row| if row.kept > 1.0 { 1.0 } else { row.kept })
         .collect();
     kept.iter().sum::<f64>() / kept.len() as f64

@@ -201,11 +201,10 @@ fn learner(task: &Arc<Task>, config: &Config) -> Result<Found> {
     agent.collect(&NEVER)?;
     let Agent { ppo, rollout, .. } = &mut agent;
     let size = config.samples_per_minibatch();
-    let flops = flops_per_sample(&ppo.policy);
     time_gradient_steps(ppo, rollout, 2)?;
     let (seconds, waiting) = time_gradient_steps(ppo, rollout, REPEATS)?;
     let samples = size as f64 / median(seconds);
-    let gflops = 1e-9 * flops * samples;
+    let gflops = 1e-9 * flops_per_sample(&ppo.policy) * samples;
     let matmul = median(matmul_gflops(ppo, size, REPEATS));
     let mut lines = format!(
         "learner                   {samples:>10.0} samples/s {gflops:.1} GFLOP/s\n\
@@ -251,14 +250,13 @@ fn end_to_end(task: &Arc<Task>, config: &Config) -> Result<Found> {
     let total = config.run.total_steps as f64;
     let hours = total / speed / 3600.0;
     let millions = total / 1e6;
-    let line = format!(
-        "end to end                {speed:>10.0} steps/s   {millions:.0} M steps take {hours:.1} h\n"
-    );
     Ok((
         vec![
             ("end_to_end_steps_per_s", speed),
             ("default_training_hours", hours),
         ],
-        line,
+        format!(
+            "end to end                {speed:>10.0} steps/s   {millions:.0} M steps take {hours:.1} h\n"
+        ),
     ))
 }

@@ -24,8 +24,7 @@ impl NoiseStd {
         let measured: Vec<&str> = layout.measured().map(|group| group.name).collect();
         for name in groups.keys() {
             if !measured.contains(&name.as_str()) {
-                let known = layout.groups.iter().any(|group| group.name == name);
-                let what = if known {
+                let what = if layout.groups.iter().any(|group| group.name == name) {
                     "is not measured"
                 } else {
                     "is not a group of the observation"

@@ -335,8 +335,8 @@ impl Task {
         let mut compilation = self.compilation.clone();
         compilation.size *= size;
         compilation.shifts |= shifts;
-        let scene = Scene::load(config.model_file(), &compilation)?;
-        Ok(scene.varied(&Physics::of_task(config).changes(&self.hand)))
+        Ok(Scene::load(config.model_file(), &compilation)?
+            .varied(&Physics::of_task(config).changes(&self.hand)))
     }
 }
 

@@ -42,7 +42,6 @@ impl Repose {
         let Some(predictor) = &task.predictor else {
             return;
         };
-        let targets = self.servos.last(task.config.prediction as usize);
         let goal = Pose {
             position: task.goal_place(),
             orientation: self.goal,
@@ -52,7 +51,7 @@ impl Repose {
             task.config.vel_obs_scale,
             observation,
             goal,
-            &targets,
+            &self.servos.last(task.config.prediction as usize),
         ) {
             Some(sim) => {
                 self.write(&sim, observation);
