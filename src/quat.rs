@@ -2,10 +2,14 @@
 
 use std::f32::consts::FRAC_1_SQRT_2 as R;
 use std::f64::consts::TAU;
-use std::ops::{Add, Mul, Sub};
+
+use rand_distr::num_traits::Float;
 
 /// A unit quaternion w, x, y, z.
 pub type Quat = [f64; 4];
+
+/// The rotation that changes nothing.
+pub const IDENTITY: Quat = [1.0, 0.0, 0.0, 0.0];
 
 const H: f32 = 0.5;
 
@@ -24,10 +28,7 @@ pub const CUBE_ROTATIONS: [[f32; 4]; 24] = [
 ];
 
 /// The Hamilton product `a ⊗ b`: first the rotation `b`, then `a`.
-pub fn mul<T: Copy + Mul<Output = T> + Add<Output = T> + Sub<Output = T>>(
-    [aw, ax, ay, az]: [T; 4],
-    [bw, bx, by, bz]: [T; 4],
-) -> [T; 4] {
+pub fn mul<T: Float>([aw, ax, ay, az]: [T; 4], [bw, bx, by, bz]: [T; 4]) -> [T; 4] {
     [
         aw * bw - ax * bx - ay * by - az * bz,
         aw * bx + ax * bw + ay * bz - az * by,
@@ -64,8 +65,8 @@ pub fn rotate(q: Quat, [x, y, z]: [f64; 3]) -> [f64; 3] {
 }
 
 /// Either `q` or `-q`, whichever has w ≥ 0, so that each rotation has one sign.
-pub fn canonical(q: Quat) -> Quat {
-    if q[0] < 0.0 { q.map(|x| -x) } else { q }
+pub fn canonical<T: Float>(q: [T; 4]) -> [T; 4] {
+    if q[0] < T::zero() { q.map(|x| -x) } else { q }
 }
 
 /// The angle in rad, 0 to π, of the rotation that takes `b` to `a`.

@@ -115,7 +115,7 @@ pub fn sum_of_squares(x: &[f32]) -> f64 {
                 .for_each(|(lane, x)| *lane += x * x);
         }
     });
-    lanes.iter().map(|&lane| f64::from(lane)).sum()
+    lanes.into_iter().map(f64::from).sum()
 }
 
 #[cfg(test)]

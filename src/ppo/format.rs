@@ -195,15 +195,15 @@ impl Array {
         let array = match view.dtype() {
             Dtype::F32 => Self::F32(
                 shape,
-                words.iter().map(|word| f32::from_le_bytes(*word)).collect(),
+                words.iter().copied().map(f32::from_le_bytes).collect(),
             ),
             Dtype::F64 => Self::F64(
                 shape,
-                longs.iter().map(|long| f64::from_le_bytes(*long)).collect(),
+                longs.iter().copied().map(f64::from_le_bytes).collect(),
             ),
             Dtype::U64 => Self::U64(
                 shape,
-                longs.iter().map(|long| u64::from_le_bytes(*long)).collect(),
+                longs.iter().copied().map(u64::from_le_bytes).collect(),
             ),
             other => bail!("has the type {other:?}, expected F32, F64 or U64"),
         };

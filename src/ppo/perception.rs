@@ -68,12 +68,7 @@ impl Perception {
             [(1..close.len()).fold(0, |best, i| if close[i] > close[best] { i } else { best })];
         for place in [object, goal] {
             let turned = quat::mul(quat::read(observation, place), best);
-            let turned = if turned[0] < 0.0 {
-                turned.map(|x| -x)
-            } else {
-                turned
-            };
-            observation[place..place + 4].copy_from_slice(&turned);
+            observation[place..place + 4].copy_from_slice(&quat::canonical(turned));
         }
     }
 

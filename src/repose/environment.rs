@@ -68,7 +68,7 @@ impl Repose {
             task: task.clone(),
             lesson: Lesson::task(&task.config),
             rng: rng::stream(0, "unused", 0),
-            goal: [1.0, 0.0, 0.0, 0.0],
+            goal: quat::IDENTITY,
             last: Step {
                 action: vec![0.0; task.hand.actuators.len()],
                 ..Step::default()

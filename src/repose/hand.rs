@@ -186,17 +186,15 @@ fn each<T>(
     find: impl Fn(&str) -> Result<T>,
     problems: &mut Vec<String>,
 ) -> Vec<T> {
-    let twice = names
-        .iter()
-        .enumerate()
-        .filter(|(i, name)| names[..*i].contains(name));
-    problems.extend(twice.map(|(_, name)| format!("`{name}` is named twice")));
-    names
-        .iter()
-        .filter_map(|name| {
-            find(name)
-                .map_err(|error| problems.push(error.to_string()))
-                .ok()
-        })
-        .collect()
+    let mut found = Vec::new();
+    for (i, name) in names.iter().enumerate() {
+        if names[..i].contains(name) {
+            problems.push(format!("`{name}` is named twice"));
+        }
+        match find(name) {
+            Ok(part) => found.push(part),
+            Err(error) => problems.push(error.to_string()),
+        }
+    }
+    found
 }

@@ -77,11 +77,11 @@ const TRAINING: [TrainingTerm; 4] = [
         |step| ((step.rot_dist_before + NEAR) / (step.rot_dist + NEAR)).ln()),
     TrainingTerm(Description("within", "The training reward for being within the tolerance."),
         None, |training, _| training.hold_reward,
-        |step| f64::from(u8::from(step.within))),
+        |step| f64::from(step.within)),
     TrainingTerm(Description("drop", "The training reward for a drop, which is negative."),
         Some(Description("drop_reward", "The training reward for the step of a drop.")),
         |training, steps| training.drop_reward.at(steps),
-        |step| f64::from(u8::from(step.dropped))),
+        |step| f64::from(step.dropped)),
 ];
 
 /// The task's reward by term, in the order of [`task_terms`].

@@ -84,7 +84,7 @@ pub fn make_consistent(observation: &mut [f32], layout: &Layout) {
         if length > 1e-6 {
             q.map(|x| x / length)
         } else {
-            [1.0, 0.0, 0.0, 0.0]
+            quat::IDENTITY
         }
     };
     let write = |observation: &mut [f32], at: usize, q: Quat| {

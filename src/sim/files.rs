@@ -33,8 +33,9 @@ impl SceneFiles {
 
     /// Whether they are the files of this scene.
     pub fn hold(&self, scene: &Path) -> bool {
-        let first = self.0.first();
-        first.is_some_and(|(name, _)| Path::new(name) == scene)
+        self.0
+            .first()
+            .is_some_and(|(name, _)| Path::new(name) == scene)
     }
 
     /// The files for MuJoCo, which reads from the disk what is not among them.

@@ -11,6 +11,7 @@ use mujoco_rs::wrappers::mj_editing::MjsBody;
 
 use super::compilation::{Compilation, VISUAL, only_seen};
 use super::constants::*;
+use crate::quat;
 
 /// The colours of the faces, as in the built-in scene: +x, -x, +y, -y, +z, -z.
 const FACES: [[f32; 3]; 6] = [
@@ -93,7 +94,7 @@ fn colour_faces(body: &mut MjsBody, half: [f64; 3], opacity: f32) {
             .with_size(size)
             .with_pos(position)
             // Regardless of the defaults of its class.
-            .with_quat([1.0, 0.0, 0.0, 0.0])
+            .with_quat(quat::IDENTITY)
             .with_rgba([red, green, blue, opacity])
             .with_group(VISUAL);
     }
@@ -106,6 +107,6 @@ fn plain_box(model: &MjModel, body: usize) -> Option<[f64; 3]> {
         && model.geom_type()[geom] == mjGEOM_BOX
         && model.geom_matid()[geom] < 0
         && model.geom_pos()[geom] == [0.0; 3]
-        && model.geom_quat()[geom] == [1.0, 0.0, 0.0, 0.0];
+        && model.geom_quat()[geom] == quat::IDENTITY;
     is_plain.then(|| model.geom_size()[geom])
 }

@@ -11,7 +11,7 @@ pub type Placed = ([f64; 3], Quat);
 /// The poses in the frame of the body `top`: of itself and of the bodies that it carries, where no joint has moved.
 pub fn frames_within(model: &MjModel, top: usize) -> Vec<Option<Placed>> {
     let mut frames = vec![None; model.nbody() as usize];
-    frames[top] = Some(([0.0; 3], [1.0, 0.0, 0.0, 0.0]));
+    frames[top] = Some(([0.0; 3], quat::IDENTITY));
     // Every body has a higher number than its parent.
     for body in top + 1..frames.len() {
         let parent = frames[model.body_parentid()[body] as usize];

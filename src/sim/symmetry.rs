@@ -103,7 +103,7 @@ impl Form {
     }
 
     fn keeps_masses(&self, turn: Quat) -> bool {
-        let own = self.moments([1.0, 0.0, 0.0, 0.0]);
+        let own = self.moments(quat::IDENTITY);
         let turned = self.moments(turn);
         let largest = |values: &[f64]| values.iter().fold(0.0, |most: f64, x| most.max(x.abs()));
         // A centre of mass that is off by a rounding error does not count.
