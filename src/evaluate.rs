@@ -15,7 +15,7 @@ use rayon::prelude::*;
 
 use crate::env::{End, Env};
 use crate::os::Bar;
-use crate::ppo::{FrozenPolicy, GROUP, Policy, Workspace};
+use crate::ppo::{FrozenPolicy, GROUP, Policy};
 use crate::ranks::Exchange;
 use crate::repose::{EpisodeStats, Repose, Score, Task};
 use crate::rng::{self, Rng};
@@ -99,6 +99,8 @@ impl Moment<'_> {
 pub struct Lane {
     /// The environment.
     pub env: Repose,
+    /// The number of its episode.
+    number: usize,
     noise: Rng,
     running: bool,
     end: Option<End>,
@@ -108,6 +110,7 @@ impl Lane {
     fn new(task: &Arc<Task>) -> Self {
         Self {
             env: Repose::new(task),
+            number: 0,
             noise: rng::stream(0, "unused", 0),
             running: false,
             end: None,
@@ -121,6 +124,7 @@ impl Lane {
         );
         self.env.take_sums();
         self.noise = rng::stream(episodes.seed, "play noise", episode as u64);
+        self.number = episode;
         self.running = true;
     }
 
@@ -161,9 +165,9 @@ const NOT_FINITE: &str = "the actions of the policy are not finite";
 /// # Errors
 /// Fails if the action is not finite.
 pub fn expect_finite_actions(task: &Arc<Task>, policy: &Policy) -> Result<()> {
-    let mut player = Player::new(task, Episodes::scored(0, 1));
-    player.step(&Actor::Mean(policy.freeze()));
-    ensure!(player.action.iter().all(|x| x.is_finite()), NOT_FINITE);
+    let player = Player::new(task, Episodes::scored(0, 1));
+    let mut actions = policy.mean_actions(&player.observation).into_iter();
+    ensure!(actions.all(f32::is_finite), NOT_FINITE);
     Ok(())
 }
 
@@ -174,15 +178,9 @@ pub fn expect_finite_actions(task: &Arc<Task>, policy: &Policy) -> Result<()> {
 /// Fails if the value is not finite.
 pub fn expect_finite_values(task: &Arc<Task>, policy: &Policy) -> Result<()> {
     let player = Player::new(task, Episodes::scored(0, 1));
-    let policy = policy.freeze();
-    let mut value = [0.0_f32];
-    policy.compute(
-        &player.observation,
-        [&mut [], &mut value],
-        &mut policy.workspace(1),
-    );
+    let value = policy.values(&player.observation)[0];
     ensure!(
-        (value[0] * value[0]).is_finite(),
+        (value * value).is_finite(),
         "the values of the policy are not finite"
     );
     Ok(())
@@ -203,16 +201,12 @@ impl Trial<'_> {
     /// # Errors
     /// Fails with the episode's number if an episode panics.
     pub fn score(&self, bar: &Bar, observe: &mut dyn FnMut(&Moment)) -> Result<Option<Score>> {
-        let mut observer = |moment: Moment| {
+        let played = self.play(&mut |moment| {
             observe(&moment);
-            if moment.ends() {
-                bar.inc(1);
-            }
+            bar.inc(moment.ends().into());
             Ok(())
-        };
-        Ok(self
-            .play(&mut observer)?
-            .map(|played| Score::of(&played, self.task.config.ctrl_dt)))
+        })?;
+        Ok(played.map(|played| Score::of(&played, self.task.config.ctrl_dt)))
     }
 
     /// Plays the episodes that `exchange` assigns to this rank, seen by the observer. Returns the episodes of all ranks in order,
@@ -239,7 +233,8 @@ impl Trial<'_> {
                 }
                 group.step(observer)?;
             }
-            results.extend((first..).zip(group.lanes[..group.count].iter_mut().map(Lane::episode)));
+            let lanes = group.lanes.iter_mut();
+            results.extend(lanes.map(|lane| (lane.number, lane.episode())));
         }
         let mut all = exchange.all_gather(results).concat();
         all.sort_unstable_by_key(|(number, _)| *number);
@@ -255,12 +250,6 @@ struct Lanes<'a> {
     observations: Vec<f32>,
     /// `[LANES, A]`
     actions: Vec<f32>,
-    work: Option<Workspace>,
-    spaces: Spaces,
-    /// The number of the first episode.
-    first: usize,
-    /// The number of episodes, which the last group may have fewer of than lanes.
-    count: usize,
 }
 
 impl<'a> Lanes<'a> {
@@ -271,24 +260,16 @@ impl<'a> Lanes<'a> {
             lanes: lanes.map(|_| Lane::new(trial.task)).collect(),
             observations: vec![0.0; LANES * spaces.observation_size],
             actions: vec![0.0; LANES * spaces.action_size],
-            work: trial.actor.policy().map(|policy| policy.workspace(LANES)),
-            spaces,
-            first: 0,
-            count: 0,
         }
     }
 
-    /// Starts the episodes from number `first` on.
+    /// Starts the episodes from number `first` on. The last group may have fewer of them than lanes.
     fn start(&mut self, first: usize, observer: &mut Observer) -> Result<()> {
         let episodes = self.trial.episodes;
-        self.first = first;
-        self.count = self
-            .lanes
-            .len()
-            .min(episodes.first + episodes.count - first);
-        let size = self.spaces.observation_size;
+        self.lanes.truncate(episodes.first + episodes.count - first);
+        let size = self.trial.task.spaces().observation_size;
         let rows = self.observations.par_chunks_exact_mut(size);
-        self.lanes[..self.count]
+        self.lanes
             .par_iter_mut()
             .zip(rows)
             .enumerate()
@@ -298,9 +279,9 @@ impl<'a> Lanes<'a> {
                 });
             });
         let rows = self.observations.chunks_exact(size);
-        for (i, (lane, observation)) in self.lanes[..self.count].iter().zip(rows).enumerate() {
+        for (lane, observation) in self.lanes.iter().zip(rows) {
             observer(Moment {
-                episode: first + i,
+                episode: lane.number,
                 env: &lane.env,
                 observation,
                 step: None,
@@ -316,55 +297,36 @@ impl<'a> Lanes<'a> {
             lanes,
             observations,
             actions,
-            work,
-            first,
-            ..
         } = self;
         let Spaces {
             observation_size,
             action_size,
             ..
-        } = self.spaces;
-        trial
-            .actor
-            .choose(observations, lanes, actions, work.as_mut());
-        let mut running = lanes
-            .iter()
-            .zip(actions.chunks_exact(action_size))
-            .filter(|(lane, _)| lane.running);
-        ensure!(
-            running.all(|(_, action)| action.iter().all(|x| x.is_finite())),
-            NOT_FINITE
-        );
+        } = trial.task.spaces();
+        trial.actor.choose(observations, lanes, actions);
         let acted = lanes
             .par_iter_mut()
             .zip(actions.par_chunks_exact(action_size));
-        let rows = acted
+        acted
             .zip(observations.par_chunks_exact_mut(observation_size))
-            .enumerate();
-        rows.filter(|(_, ((lane, _), _))| lane.running)
-            .try_for_each(|(i, ((lane, action), row))| {
-                let episode = *first + i;
-                let stepped = stepping("episode", episode, || caught(|| lane.step(action, row)));
-                stepped
-                    .map(drop)
-                    .map_err(|panic| anyhow!("episode {episode} panicked: {panic}"))
+            .filter(|((lane, _), _)| lane.running)
+            .try_for_each(|((lane, action), row)| {
+                ensure!(action.iter().all(|x| x.is_finite()), NOT_FINITE);
+                let number = lane.number;
+                let stepped = stepping("episode", number, || caught(|| lane.step(action, row)));
+                stepped.map_err(|panic| anyhow!("episode {number} panicked: {panic}"))?;
+                Ok(())
             })?;
         let rows = observations
             .chunks_exact(observation_size)
             .zip(actions.chunks_exact(action_size));
-        let running = lanes
-            .iter_mut()
-            .zip(rows)
-            .enumerate()
-            .filter(|(_, (lane, _))| lane.running);
-        for (i, (lane, (observation, action))) in running {
-            let step = Some((action, lane.end));
+        let running = lanes.iter_mut().zip(rows);
+        for (lane, (observation, action)) in running.filter(|(lane, _)| lane.running) {
             observer(Moment {
-                episode: *first + i,
+                episode: lane.number,
                 env: &lane.env,
                 observation,
-                step,
+                step: Some((action, lane.end)),
             })?;
             lane.running = lane.end.is_none();
         }
@@ -400,34 +362,23 @@ impl Actor<'_> {
         }
     }
 
-    fn policy(&self) -> Option<&FrozenPolicy<'_>> {
-        match self {
-            Actor::Mean(policy) | Actor::Stochastic(policy) => Some(policy),
-            _ => None,
-        }
-    }
-
     /// Writes the actions of these lanes, of which there is at least one, one row each. Actions of lanes that have ended are not used.
-    fn choose(
-        &self,
-        observations: &[f32],
-        lanes: &mut [Lane],
-        actions: &mut [f32],
-        work: Option<&mut Workspace>,
-    ) {
-        if let (Some(policy), Some(work)) = (self.policy(), work) {
-            policy.compute(observations, [actions, &mut []], work);
-        }
+    fn choose(&self, observations: &[f32], lanes: &mut [Lane], actions: &mut [f32]) {
         let Spaces {
             observation_size,
             action_size: size,
             ..
         } = lanes[0].env.spaces();
-        if let Actor::Outside(act) = self {
-            act(
+        match self {
+            Actor::Mean(policy) | Actor::Stochastic(policy) => {
+                let mut work = policy.workspace(actions.len() / size);
+                policy.compute(observations, [actions, &mut []], &mut work);
+            }
+            Actor::Outside(act) => act(
                 &observations[..lanes.len() * observation_size],
                 &mut actions[..lanes.len() * size],
-            );
+            ),
+            _ => {}
         }
         for (lane, row) in lanes.iter_mut().zip(actions.chunks_exact_mut(size)) {
             match self {
@@ -458,8 +409,6 @@ pub struct Player {
     pub lane: Lane,
     observation: Vec<f32>,
     action: Vec<f32>,
-    /// The policy's workspace, from the first step of an episode on.
-    work: Option<Workspace>,
 }
 
 impl Player {
@@ -470,13 +419,10 @@ impl Player {
             action_size,
             ..
         } = task.spaces();
-        let observation = vec![0.0; observation_size];
-        let action = vec![0.0; action_size];
         let mut player = Self {
             lane: Lane::new(task),
-            observation,
-            action,
-            work: None,
+            observation: vec![0.0; observation_size],
+            action: vec![0.0; action_size],
         };
         player.start(episodes, episodes.first);
         player
@@ -485,28 +431,17 @@ impl Player {
     /// Starts the episode with the given number.
     pub fn start(&mut self, episodes: Episodes, episode: usize) {
         self.lane.start(episodes, episode, &mut self.observation);
-        self.work = None;
     }
 
-    /// Takes one step with the action of `actor`, and returns the end of the episode if the step ended it. The sizes of its
-    /// policy must be the same throughout an episode.
+    /// Takes one step with the action of `actor`, and returns the end of the episode if the step ended it.
     pub fn step(&mut self, actor: &Actor) -> Option<End> {
         self.step_changed(actor, |_| {})
     }
 
     /// Takes one step with the action of `actor` after a change to it.
     pub fn step_changed(&mut self, actor: &Actor, change: impl FnOnce(&mut [f32])) -> Option<End> {
-        self.work = self
-            .work
-            .take()
-            .or_else(|| actor.policy().map(|policy| policy.workspace(1)));
         let lane = std::slice::from_mut(&mut self.lane);
-        actor.choose(
-            &self.observation,
-            lane,
-            &mut self.action,
-            self.work.as_mut(),
-        );
+        actor.choose(&self.observation, lane, &mut self.action);
         change(&mut self.action);
         self.lane.step(&self.action, &mut self.observation)
     }
@@ -539,7 +474,6 @@ mod tests {
             }
             let ppo = Ppo::new(&config.ppo, spaces, 0, Exchange::alone(1)).unwrap();
             let actor = Actor::Mean(ppo.policy.freeze());
-            let mut work = actor.policy().map(|policy| policy.workspace(2));
             // Cube and goal coincide: once unrotated, once both rotated by half a turn about their own x axis.
             let Spaces {
                 observation_size: size,
@@ -557,7 +491,7 @@ mod tests {
             }
             let (mut lanes, mut actions) =
                 ([Lane::new(&task), Lane::new(&task)], vec![0.0; 2 * 20]);
-            actor.choose(&observations, &mut lanes, &mut actions, work.as_mut());
+            actor.choose(&observations, &mut lanes, &mut actions);
             let (one, other) = actions.split_at(20);
             assert_eq!(one == other, alike);
         }

@@ -60,9 +60,8 @@ impl PolicySource {
     /// Fails if there is no such file, run folder or checkpoint, or if the name is of an actor without a policy.
     pub fn find(place: &Path) -> Result<Self> {
         let name = place.display();
-        let needs_none = Actor::without_policy(place).is_some();
         ensure!(
-            !needs_none,
+            Actor::without_policy(place).is_none(),
             "`{name}` acts without a policy; a file or folder of that name is ./{name}"
         );
         match BUILTIN
@@ -120,7 +119,10 @@ impl PolicySource {
     /// Fails as [`settings`] does.
     fn settings(&self, checkpoint: &Checkpoint, overrides: &[Override]) -> Result<Config> {
         let path = self.path();
-        let config = settings(checkpoint, path, player(checkpoint), overrides);
+        let player = Reader::Player {
+            env_steps: checkpoint.progress.env_steps,
+        };
+        let config = settings(checkpoint, path, player, overrides);
         match self {
             Self::BuiltIn(_) => config,
             Self::File(_) => config.with_context(|| cannot_use(path)),
@@ -184,17 +186,16 @@ impl Loaded {
         let record = Record::parse(&checkpoint.hand)?;
         let policy = Policy::load(&config.ppo, record.spaces(), &checkpoint)
             .with_context(|| format!("cannot use the policy {origin}"))?;
-        let name = match &origin {
-            PolicySource::BuiltIn(policy) => policy.title.to_owned(),
-            PolicySource::File(path) => format!(
-                "{}, {} control steps",
-                path.display(),
-                checkpoint.progress.env_steps
-            ),
-        };
         Ok(Self {
+            name: match &origin {
+                PolicySource::BuiltIn(policy) => policy.title.to_owned(),
+                PolicySource::File(path) => format!(
+                    "{}, {} control steps",
+                    path.display(),
+                    checkpoint.progress.env_steps
+                ),
+            },
             origin,
-            name,
             record,
             policy,
             checkpoint,
@@ -268,12 +269,10 @@ fn first_sound(places: &[PathBuf]) -> Result<(PathBuf, Checkpoint)> {
 
 /// Whether the file is not there.
 fn is_absence(error: &Error) -> bool {
-    let kinds = error
+    let mut causes = error
         .chain()
         .filter_map(|cause| cause.downcast_ref::<std::io::Error>());
-    kinds
-        .map(std::io::Error::kind)
-        .any(|kind| kind == std::io::ErrorKind::NotFound)
+    causes.any(|cause| cause.kind() == std::io::ErrorKind::NotFound)
 }
 
 /// Whether the bytes of the file are damaged, as opposed to intact but unusable.
@@ -299,13 +298,6 @@ pub fn settings(
     Ok(config)
 }
 
-/// What plays the policy of a checkpoint.
-fn player(checkpoint: &Checkpoint) -> Reader {
-    Reader::Player {
-        env_steps: checkpoint.progress.env_steps,
-    }
-}
-
 /// The settings in a checkpoint in the file `path`, as text.
 pub fn source(checkpoint: &Checkpoint, path: &Path) -> Source {
     Source::new(path, &*checkpoint.config)
@@ -328,11 +320,7 @@ pub fn for_fork(
         ref fork,
         ..
     } = checkpoint.progress;
-    let made = iteration
-        - fork
-            .as_ref()
-            .map_or(0, |fork| fork.iteration)
-            .min(iteration);
+    let made = iteration.saturating_sub(fork.as_ref().map_or(0, |fork| fork.iteration));
     let mut after = parent.clone();
     if made > parent.ppo.critic_first {
         after.ppo.critic_first = 0;

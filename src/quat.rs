@@ -1,13 +1,17 @@
 //! Unit quaternions as `[w, x, y, z]`, the order that MuJoCo uses. A quaternion and its negative are the same rotation.
 
-use std::f32::consts::FRAC_1_SQRT_2;
-use std::ops::{Add, Mul, Sub};
+use std::f32::consts::FRAC_1_SQRT_2 as R;
+use std::f64::consts::TAU;
+
+use rand_distr::num_traits::Float;
 
 /// A unit quaternion w, x, y, z.
 pub type Quat = [f64; 4];
 
+/// The rotation that changes nothing.
+pub const IDENTITY: Quat = [1.0, 0.0, 0.0, 0.0];
+
 const H: f32 = 0.5;
-const R: f32 = FRAC_1_SQRT_2;
 
 /// The rotations that map a cube onto itself, as w, x, y, z. Each pair q and -q has one entry.
 #[rustfmt::skip]
@@ -23,24 +27,19 @@ pub const CUBE_ROTATIONS: [[f32; 4]; 24] = [
     [H, H, -H, -H], [H, -H, H, -H], [H, -H, -H, H], [H, -H, -H, -H],
 ];
 
-/// A set of the rotations of a cube, given by their numbers, as bits.
-pub fn mask(rotations: &[usize]) -> u32 {
-    rotations
-        .iter()
-        .fold(0, |mask, rotation| mask | 1 << rotation)
-}
-
 /// The Hamilton product `a ⊗ b`: first the rotation `b`, then `a`.
-pub fn mul<T: Copy + Mul<Output = T> + Add<Output = T> + Sub<Output = T>>(
-    [aw, ax, ay, az]: [T; 4],
-    [bw, bx, by, bz]: [T; 4],
-) -> [T; 4] {
+pub fn mul<T: Float>([aw, ax, ay, az]: [T; 4], [bw, bx, by, bz]: [T; 4]) -> [T; 4] {
     [
         aw * bw - ax * bx - ay * by - az * bz,
         aw * bx + ax * bw + ay * bz - az * by,
         aw * by - ax * bz + ay * bw + az * bx,
         aw * bz + ax * by - ay * bx + az * bw,
     ]
+}
+
+/// The quaternion in these values from `at` on.
+pub fn read<T: Copy>(values: &[T], at: usize) -> [T; 4] {
+    *values[at..].first_chunk().expect("a quaternion")
 }
 
 /// The inverse rotation.
@@ -66,8 +65,8 @@ pub fn rotate(q: Quat, [x, y, z]: [f64; 3]) -> [f64; 3] {
 }
 
 /// Either `q` or `-q`, whichever has w ≥ 0, so that each rotation has one sign.
-pub fn canonical(q: Quat) -> Quat {
-    if q[0] < 0.0 { q.map(|x| -x) } else { q }
+pub fn canonical<T: Float>(q: [T; 4]) -> [T; 4] {
+    if q[0] < T::zero() { q.map(|x| -x) } else { q }
 }
 
 /// The angle in rad, 0 to π, of the rotation that takes `b` to `a`.
@@ -94,8 +93,8 @@ pub fn rotation_vector(q: Quat) -> [f64; 3] {
 pub fn uniform([u, v, w]: [f64; 3]) -> Quat {
     let inner = (1.0 - u).sqrt();
     let outer = u.sqrt();
-    let (sin_v, cos_v) = (std::f64::consts::TAU * v).sin_cos();
-    let (sin_w, cos_w) = (std::f64::consts::TAU * w).sin_cos();
+    let (sin_v, cos_v) = (TAU * v).sin_cos();
+    let (sin_w, cos_w) = (TAU * w).sin_cos();
     [outer * cos_w, inner * sin_v, inner * cos_v, outer * sin_w]
 }
 

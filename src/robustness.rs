@@ -133,15 +133,9 @@ fn played(
     episodes: Episodes,
     requests: &Requests,
 ) -> Result<Vec<Scored>> {
-    let is_known = |i: usize, task: &Task| {
-        playable[..i]
-            .iter()
-            .any(|(_, other)| other.config == task.config)
-    };
-    let different = playable
-        .iter()
-        .enumerate()
-        .filter(|(i, (_, task))| !is_known(*i, task))
+    let configs: Vec<_> = playable.iter().map(|(_, task)| &task.config).collect();
+    let different = (0..configs.len())
+        .filter(|&i| !configs[..i].contains(&configs[i]))
         .count();
     let bar = os::progress_bar(
         (different * episodes.count) as u64,
@@ -213,9 +207,8 @@ fn conditions() -> Vec<Condition> {
     }
     for friction in FRICTIONS {
         for mass in MASSES {
-            let name = format!("friction {friction}, cube mass {mass}");
             conditions.push(Condition {
-                name,
+                name: format!("friction {friction}, cube mass {mass}"),
                 sets: vec![set(FRICTION, friction), set(MASS, mass)],
             });
         }
@@ -225,23 +218,20 @@ fn conditions() -> Vec<Condition> {
 
 /// The mean fraction of goals over the single changes, each counted as at most 1.
 fn mean_kept(rows: &[Scored]) -> f64 {
-    let single = rows
+    let kept: Vec<f64> = rows
         .iter()
         .skip(1)
-        .filter(|row| !row.condition.is_in_grid());
-    let kept: Vec<f64> = single
+        .filter(|row| !row.condition.is_in_grid())
         .map(|row| if row.kept > 1.0 { 1.0 } else { row.kept })
         .collect();
     kept.iter().sum::<f64>() / kept.len() as f64
 }
 
 fn as_json(rows: &[Scored], episodes: usize, seed: u64, checkpoint: &str) -> Value {
-    let of_row = |row: &Scored| {
+    let list = rows.iter().map(|row| {
         let value = |set: &Override| {
-            let table: toml::Table = format!("value = {}", set.value)
-                .parse()
-                .expect("the values are TOML");
-            (set.key.clone(), json!(table["value"]))
+            let value: toml::Value = set.value.parse().expect("the values are TOML");
+            (set.key.clone(), json!(value))
         };
         json!({
             "name": row.condition.name,
@@ -251,10 +241,10 @@ fn as_json(rows: &[Scored], episodes: usize, seed: u64, checkpoint: &str) -> Val
             measure("drop_rate").key: row.score["drop_rate"],
             "kept": row.kept,
         })
-    };
-    let list: Vec<Value> = rows.iter().map(of_row).collect();
+    });
     json!({
-        "episodes": episodes, "seed": seed, "checkpoint": checkpoint, "rows": list, "mean_kept": mean_kept(rows),
+        "episodes": episodes, "seed": seed, "checkpoint": checkpoint, "rows": list.collect::<Value>(),
+        "mean_kept": mean_kept(rows),
     })
 }
 
@@ -293,17 +283,15 @@ fn picture(rows: &[Scored], episodes: usize, checkpoint: &str) -> BarChart {
         .filter(|row| !row.condition.is_in_grid())
         .map(|row| {
             let nominal = rows[0].score["goals"];
-            let note = format!(
-                "{:.2} goals, {:.0} % drops",
-                row.score["goals"],
-                100.0 * row.score["drop_rate"]
-            );
-            let interval = row.score.goals_ci95.map(|goals| goals / nominal);
             draw::NamedBar {
                 name: row.condition.name.clone(),
                 value: row.kept,
-                interval,
-                note,
+                interval: row.score.goals_ci95.map(|goals| goals / nominal),
+                note: format!(
+                    "{:.2} goals, {:.0} % drops",
+                    row.score["goals"],
+                    100.0 * row.score["drop_rate"]
+                ),
             }
         });
     let grid: Vec<f64> = rows
@@ -311,14 +299,10 @@ fn picture(rows: &[Scored], episodes: usize, checkpoint: &str) -> BarChart {
         .filter(|row| row.condition.is_in_grid())
         .map(|row| row.kept)
         .collect();
-    let row = |mass: usize| {
-        grid.iter()
-            .skip(mass)
-            .step_by(MASSES.len())
-            .copied()
-            .collect()
-    };
-    let cells = (0..MASSES.len()).map(row).collect();
+    let of_mass = |mass| grid.iter().skip(mass).step_by(MASSES.len());
+    let cells = (0..MASSES.len())
+        .map(|mass| of_mass(mass).copied().collect())
+        .collect();
     let named = |name: &str, values: &[&str]| {
         values
             .iter()

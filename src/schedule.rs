@@ -35,21 +35,14 @@ pub fn in_rounds<B: Send>(
     let waiting: Mutex<VecDeque<(&mut B, usize)>> =
         Mutex::new(blocks.iter_mut().map(|block| (block, 0)).collect());
     // The lock is not held during work, so no panic can occur under it.
+    let queue = || waiting.lock().expect("no panic under this lock");
     rayon::broadcast(|_| {
-        loop {
-            let Some((block, round)) = waiting
-                .lock()
-                .expect("no panic under this lock")
-                .pop_front()
-            else {
-                break;
-            };
+        // A closure gives the lock back before the work.
+        let next = || queue().pop_front();
+        while let Some((block, round)) = next() {
             if round < rounds {
                 work(block, round);
-                waiting
-                    .lock()
-                    .expect("no panic under this lock")
-                    .push_back((block, round + 1));
+                queue().push_back((block, round + 1));
             }
         }
     });
@@ -67,8 +60,10 @@ pub fn caught<T>(work: impl FnOnce() -> T) -> Result<T, String> {
 
 /// The message of a panic.
 pub fn panic_message(panic: &(dyn Any + Send)) -> &str {
-    let text = panic.downcast_ref::<String>().map(String::as_str);
-    text.or_else(|| panic.downcast_ref::<&str>().copied())
+    panic
+        .downcast_ref::<String>()
+        .map(String::as_str)
+        .or_else(|| panic.downcast_ref::<&str>().copied())
         .unwrap_or("no message")
 }
 

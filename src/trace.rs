@@ -26,11 +26,10 @@ impl Trace {
         let hand = &task.hand;
         // The entries that are not zero: row, column and value.
         let mirror = task.mirror().map(|matrix| -> Value {
-            let entries = matrix
+            matrix
                 .iter()
                 .enumerate()
-                .filter(|(_, value)| **value != 0.0);
-            entries
+                .filter(|(_, value)| **value != 0.0)
                 .map(|(i, value)| json!([i / hand.layout.size, i % hand.layout.size, value]))
                 .collect()
         });
@@ -56,10 +55,10 @@ impl Trace {
             "quaternion_order": "wxyz",
             "vel_obs_scale": config.vel_obs_scale,
             "mirror_matrix": mirror,
+            "warnings": task.warnings,
+            "prediction": config.prediction,
+            "predicted_with": task.predicted_with().map(physical),
         });
-        header["warnings"] = json!(task.warnings);
-        header["prediction"] = json!(config.prediction);
-        header["predicted_with"] = json!(task.predicted_with().map(physical));
         add_settings(config, &mut header);
         Self {
             header,

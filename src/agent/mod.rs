@@ -84,13 +84,18 @@ impl Agent<Repose> {
     /// Fails if this machine does not support the precision, or if the scene cannot be randomised in the way that is asked.
     pub fn for_task(task: &Arc<Task>, config: &Config, exchange: Exchange) -> Result<Self> {
         let randomization = Randomization::new(task, &config.randomization)?;
-        let own = exchange.own(config.env.num_envs);
-        let envs = own
+        let envs = exchange
+            .own(config.env.num_envs)
             .map(|_| Repose::randomized(task, randomization.as_ref()))
             .collect();
         let settings = config.clone();
-        let lessons = move |env_steps| Lesson::at(env_steps, &settings);
-        Self::new(envs, &config.ppo, config.run.seed, exchange, lessons)
+        Self::new(
+            envs,
+            &config.ppo,
+            config.run.seed,
+            exchange,
+            move |env_steps| Lesson::at(env_steps, &settings),
+        )
     }
 }
 
@@ -110,18 +115,14 @@ impl<E: Env> Agent<E> {
         let mut pool = EnvPool::new(seed, envs, &exchange);
         let ppo = Ppo::new(config, pool.spaces(), seed, exchange.clone())?;
         let mut rollout = ppo.rollout(&pool.block_sizes());
-        let work = pool
-            .block_sizes()
-            .into_iter()
-            .map(|envs| ppo.workspace(envs))
-            .collect();
         pool.set_lesson(lessons(0));
         pool.reset(rollout.first_observations_mut());
+        let sizes = pool.block_sizes().into_iter();
         Ok(Self {
+            work: sizes.map(|envs| ppo.workspace(envs)).collect(),
             pool,
             ppo,
             rollout,
-            work,
             lessons: Box::new(lessons),
             iteration: 0,
             env_steps: 0,
@@ -249,9 +250,8 @@ impl<E: Resumable> Agent<E> {
         self.ppo
             .begin_after(self.fork.as_ref().map_or(0, |fork| fork.iteration));
         self.ppo.restore(checkpoint)?;
-        let numbers = checkpoint.take_doubles(NUMBERS)?;
         let state = EnvState {
-            numbers,
+            numbers: checkpoint.take_doubles(NUMBERS)?,
             counters: checkpoint.take_counters(COUNTERS)?,
         };
         self.pool
@@ -309,9 +309,8 @@ pub fn expect_states(checkpoint: &Checkpoint, config: &Config) -> Result<()> {
     // An iteration makes at least as many steps as the first one, and at most as many as the last one.
     let least = i128::from(config.steps_per_iteration());
     let most = (config.env.num_envs * config.ppo.horizon_at(u64::MAX)) as i128;
-    let possible = own >= 0 && (own * least..=own * most).contains(&steps) && steps % least == 0;
     ensure!(
-        possible,
+        own >= 0 && (own * least..=own * most).contains(&steps) && steps % least == 0,
         "{iteration} iterations cannot have made {env_steps} steps"
     );
     for name in [NUMBERS, COUNTERS] {

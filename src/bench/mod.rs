@@ -8,7 +8,8 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use anyhow::{Context, Result};
-use rand_distr::{Distribution, StandardNormal};
+use rand::RngExt;
+use rand_distr::StandardNormal;
 use serde_json::json;
 
 use crate::agent::{Agent, step_block};
@@ -114,11 +115,10 @@ impl Bursts {
         pool.set_lesson(lesson);
         let mut rollout = Rollout::new(BURST, &pool.block_sizes(), &task.spaces());
         pool.reset(rollout.first_observations_mut());
-        let noise = rng::stream(config.run.seed, "bench", 0);
         Ok(Self {
             pool,
             rollout,
-            noise,
+            noise: rng::stream(config.run.seed, "bench", 0),
             std: config.ppo.std.at(0) as f32,
         })
     }
@@ -131,13 +131,13 @@ impl Bursts {
             noise,
             std,
         } = self;
-        let actions = rollout
+        for action in rollout
             .blocks
             .iter_mut()
-            .flat_map(|block| &mut block.actions);
-        actions.for_each(|action| {
-            *action = *std * Distribution::<f32>::sample(&StandardNormal, noise)
-        });
+            .flat_map(|block| &mut block.actions)
+        {
+            *action = *std * noise.sample::<f32, _>(StandardNormal);
+        }
         pool.envs_mut().for_each(RecordingEnv::begin);
         let start = Instant::now();
         let stepped = in_rounds(
@@ -181,18 +181,17 @@ fn physics_and_pool(task: &Arc<Task>, config: &Config) -> Result<Found> {
             .for_each(|(rates, rate)| rates.push(rate));
     }
     let [physics, pool, share] = rates.map(median);
-    let lines = format!(
-        "physics alone (mj_step)   {physics:>10.0} steps/s\n\
-         environments              {pool:>10.0} steps/s   {:.1} % of the physics\n",
-        100.0 * share
-    );
     Ok((
         vec![
             ("physics_steps_per_s", physics),
             ("pool_steps_per_s", pool),
             ("pool_share", share),
         ],
-        lines,
+        format!(
+            "physics alone (mj_step)   {physics:>10.0} steps/s\n\
+             environments              {pool:>10.0} steps/s   {:.1} % of the physics\n",
+            100.0 * share
+        ),
     ))
 }
 
@@ -202,11 +201,10 @@ fn learner(task: &Arc<Task>, config: &Config) -> Result<Found> {
     agent.collect(&NEVER)?;
     let Agent { ppo, rollout, .. } = &mut agent;
     let size = config.samples_per_minibatch();
-    let flops = flops_per_sample(&ppo.policy);
     time_gradient_steps(ppo, rollout, 2)?;
     let (seconds, waiting) = time_gradient_steps(ppo, rollout, REPEATS)?;
     let samples = size as f64 / median(seconds);
-    let gflops = 1e-9 * flops * samples;
+    let gflops = 1e-9 * flops_per_sample(&ppo.policy) * samples;
     let matmul = median(matmul_gflops(ppo, size, REPEATS));
     let lines = format!(
         "learner                   {samples:>10.0} samples/s {gflops:.1} GFLOP/s\n\
@@ -248,14 +246,13 @@ fn end_to_end(task: &Arc<Task>, config: &Config) -> Result<Found> {
     let total = config.run.total_steps as f64;
     let hours = total / speed / 3600.0;
     let millions = total / 1e6;
-    let line = format!(
-        "end to end                {speed:>10.0} steps/s   {millions:.0} M steps take {hours:.1} h\n"
-    );
     Ok((
         vec![
             ("end_to_end_steps_per_s", speed),
             ("default_training_hours", hours),
         ],
-        line,
+        format!(
+            "end to end                {speed:>10.0} steps/s   {millions:.0} M steps take {hours:.1} h\n"
+        ),
     ))
 }

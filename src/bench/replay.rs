@@ -73,15 +73,9 @@ impl RecordingEnv {
         self.scenes.clear();
         for Start { draw, .. } in &self.starts {
             if *draw != self.drawn.0 {
-                let scene = self
-                    .randomization
-                    .as_ref()
-                    .map(|all| all.scene_of(draw.as_ref(), &self.env.task.hand))
-                    .map(|(scene, changes)| scene.varied(&changes));
-                self.drawn = (
-                    draw.clone(),
-                    scene.unwrap_or_else(|| self.env.task.scene.clone()),
-                );
+                let randomization = self.randomization.as_ref().expect("it has drawn");
+                let (scene, changes) = randomization.scene_of(draw.as_ref(), &self.env.task.hand);
+                self.drawn = (draw.clone(), scene.varied(&changes));
             }
             self.scenes.push(self.drawn.1.clone());
         }
@@ -162,11 +156,9 @@ pub fn replay(pool: &mut EnvPool<RecordingEnv>) -> Result<f64> {
             .for_each(|member| member.env.replay(step));
     });
     let seconds = start.elapsed().as_secs_f64();
-    let same = pool
-        .envs_mut()
-        .all(|env| env.bare.qpos() == env.env.sim.qpos());
+    let mut envs = pool.envs_mut();
     ensure!(
-        same,
+        envs.all(|env| env.bare.qpos() == env.env.sim.qpos()),
         "the replay of the physics did not end in the states of the environments"
     );
     Ok(seconds)

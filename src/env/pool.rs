@@ -80,8 +80,8 @@ impl<E: Env> EnvPool<E> {
         );
         let all = in_shard * exchange.shards;
         let sizes = block_sizes(in_shard, all);
-        let first_block = shards.start * sizes.len();
-        let member = |(number, env)| Member {
+        let members = (shards.start * in_shard..).zip(envs);
+        let mut members = members.map(|(number, env)| Member {
             env,
             end: None,
             final_observation: vec![0.0; spaces.observation_size],
@@ -89,19 +89,16 @@ impl<E: Env> EnvPool<E> {
             seed,
             next_episode: number as u64,
             stride: all as u64,
-        };
-        let mut members = (shards.start * in_shard..).zip(envs).map(member);
-        let block = |(number, size)| EnvBlock {
+        });
+        let blocks = (shards.start * sizes.len()..).zip(sizes.repeat(shards.len()));
+        let blocks = blocks.map(|(number, size)| EnvBlock {
             number,
             members: members.by_ref().take(size).collect(),
             spaces,
             finished: Vec::new(),
-        };
+        });
         Self {
-            blocks: (first_block..)
-                .zip(sizes.repeat(shards.len()))
-                .map(block)
-                .collect(),
+            blocks: blocks.collect(),
         }
     }
 
@@ -174,15 +171,11 @@ impl<E: Env> EnvPool<E> {
             .into_par_iter()
             .enumerate()
             .with_max_len(MOST_AT_ONCE)
-            .map(|(place, (member, row))| {
-                let episode = member.step(autoreset, row)?;
-                Ok(episode.map(|episode| (place, episode)))
+            .filter_map(|(place, (member, row))| {
+                let ended = member.step(autoreset, row).transpose()?;
+                Some(ended.map(|episode| (place, episode)))
             });
-        Ok(ended
-            .collect::<Result<Vec<_>>>()?
-            .into_iter()
-            .flatten()
-            .collect())
+        ended.collect()
     }
 
     /// Switches all environments to `lesson` from the next step on.
@@ -247,9 +240,7 @@ impl<E: Resumable> EnvPool<E> {
             stepping("environment", number, restore)
                 .with_context(|| format!("environment {number}"))?;
         }
-        self.blocks
-            .iter_mut()
-            .for_each(|block| block.finished.clear());
+        self.take_finished();
         Ok(())
     }
 }
@@ -299,9 +290,8 @@ fn rows<'a>(
     rewards: &'a mut [f32],
     observations: &'a mut [f32],
 ) -> impl Iterator<Item = Row<'a>> {
-    let found = [actions.len(), rewards.len(), observations.len()];
     assert_eq!(
-        found,
+        [actions.len(), rewards.len(), observations.len()],
         [n * action_size, n, n * observation_size],
         "lengths of the actions, rewards and observations"
     );

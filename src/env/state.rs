@@ -46,12 +46,9 @@ impl EnvState {
     pub fn rows(&self, count: usize) -> Result<impl Iterator<Item = SavedEnv<'_>>> {
         let numbers = self.numbers.len();
         let counters = self.counters.len();
-        let even = numbers.is_multiple_of(count)
-            && counters.is_multiple_of(count)
-            && numbers >= count
-            && counters >= count;
+        let mut found = [numbers, counters].into_iter();
         ensure!(
-            even,
+            found.all(|found| found >= count && found.is_multiple_of(count)),
             "{numbers} numbers and {counters} counters are not the states of {count} environments"
         );
         let rows = self
@@ -68,11 +65,7 @@ impl<'a> SavedEnv<'a> {
     /// # Errors
     /// Fails if fewer are left.
     pub fn numbers<const N: usize>(&mut self) -> Result<[f64; N]> {
-        let next = self
-            .numbers
-            .split_off(..N)
-            .and_then(|next| next.first_chunk().copied());
-        next.context("the state has too few numbers")
+        Ok(self.next(N)?.try_into()?)
     }
 
     /// Reads the next `count` numbers.
@@ -99,11 +92,8 @@ impl<'a> SavedEnv<'a> {
     /// # Errors
     /// Fails if fewer are left.
     pub fn counters<const N: usize>(&mut self) -> Result<[u64; N]> {
-        let next = self
-            .counters
-            .split_off(..N)
-            .and_then(|next| next.first_chunk().copied());
-        next.context("the state has too few counters")
+        let next = self.counters.split_off(..N);
+        Ok(next.context("the state has too few counters")?.try_into()?)
     }
 
     /// Checks that everything has been read.

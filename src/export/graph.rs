@@ -35,9 +35,9 @@ pub fn policy_graph(policy: &Policy, mirror: Option<&[f32]>) -> Graph {
     };
     graph.floats("mean", &[size], &mean);
     graph.floats("factor", &[size], &factor);
-    let centred = graph.node("Sub", &[&seen, "mean"], "centred", &[]);
-    let scaled = graph.node("Mul", &[&centred, "factor"], "scaled", &[]);
-    let normalised = clip(&mut graph, &scaled, CLIP, "normalised");
+    graph.node("Sub", &[&seen, "mean"], "centred", &[]);
+    graph.node("Mul", &["centred", "factor"], "scaled", &[]);
+    let normalised = clip(&mut graph, "scaled", CLIP, "normalised");
     let means = actor(&mut graph, policy, normalised);
     clip(&mut graph, &means, 1.0, "actions");
     graph
@@ -95,33 +95,32 @@ fn canonicalize(
     for (name, sign) in [("zero", 0.0), ("plus", 1.0), ("minus", -1.0)] {
         graph.floats(name, &[1], &[sign]);
     }
-    let parts = [
+    graph.index("axis", 1);
+    for (name, ends) in [
         ("before", [0, object]),
         ("cube", [object, object + 4]),
         ("between", [object + 4, goal]),
         ("goal", [goal, goal + 4]),
         ("after", [goal + 4, size]),
-    ];
-    graph.index("axis", 1);
-    for (name, ends) in parts {
+    ] {
         slice(graph, obs, ends, name);
     }
-    let near = graph.node("MatMul", &["cube", "cosines"], "near", &[]);
-    let nearness = graph.node("Abs", &[&near], "nearness", &[]);
+    graph.node("MatMul", &["cube", "cosines"], "near", &[]);
+    graph.node("Abs", &["near"], "nearness", &[]);
     // The first of equals, as in `ppo::perception`.
-    let nearest = graph.node(
+    graph.node(
         "ArgMax",
-        &[&nearness],
+        &["nearness"],
         "nearest",
         &[("axis", Int(1)), ("keepdims", Int(0))],
     );
-    let product = graph.node(
+    graph.node(
         "Gather",
-        &["products", &nearest],
+        &["products", "nearest"],
         "product",
         &[("axis", Int(0))],
     );
-    let [object, goal] = ["cube", "goal"].map(|quaternion| rotated(graph, quaternion, &product));
+    let [object, goal] = ["cube", "goal"].map(|quaternion| rotated(graph, quaternion));
     graph.node(
         "Concat",
         &["before", &object, "between", &goal, "after"],
@@ -146,11 +145,11 @@ fn add_rotations(graph: &mut Graph, rotations: &[[f32; 4]]) {
     graph.floats("products", &[24, 4, 4], &products);
 }
 
-/// Multiplies a quaternion by the rotation, and negates it if w is negative then.
-fn rotated(graph: &mut Graph, quaternion: &str, product: &str) -> String {
+/// Multiplies a quaternion by the rotation `product`, and negates it if w is negative then.
+fn rotated(graph: &mut Graph, quaternion: &str) -> String {
     let name = |what: &str| format!("{quaternion}_{what}");
     let row = graph.node("Unsqueeze", &[quaternion, "axis"], &name("row"), &[]);
-    let rotated = graph.node("MatMul", &[&row, product], &name("turned_row"), &[]);
+    let rotated = graph.node("MatMul", &[&row, "product"], &name("turned_row"), &[]);
     let rotated = graph.node("Squeeze", &[&rotated, "axis"], &name("turned"), &[]);
     let w = slice(graph, &rotated, [0, 1], &name("w"));
     let negative = graph.node("Less", &[&w, "zero"], &name("negative"), &[]);

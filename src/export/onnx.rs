@@ -93,23 +93,20 @@ impl Graph {
             .text(3, env!("CARGO_PKG_VERSION"))
             .message(7, &self.0)
             .message(8, &Message::default().text(1, "").int(2, OPSET));
-        let entry = |(key, value): &(&str, String)| Message::default().text(1, key).text(2, value);
         metadata
             .iter()
-            .fold(model, |model, text| model.message(14, &entry(text)))
+            .fold(model, |model, (key, value)| {
+                model.message(14, &Message::default().text(1, key).text(2, value))
+            })
             .0
     }
 }
 
 /// Describes a value `[batch, size]` of floats.
 fn rows_of((name, size): (&str, usize)) -> Message {
-    let dimensions = [
-        Message::default().text(2, "batch"),
-        Message::default().int(1, size as i64),
-    ];
-    let shape = dimensions
-        .iter()
-        .fold(Message::default(), |shape, size| shape.message(1, size));
+    let shape = Message::default()
+        .message(1, &Message::default().text(2, "batch"))
+        .message(1, &Message::default().int(1, size as i64));
     let kind = Message::default().message(1, &Message::default().int(1, FLOAT).message(2, &shape));
     Message::default().text(1, name).message(2, &kind)
 }

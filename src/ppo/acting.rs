@@ -39,8 +39,8 @@ impl Acting<'_> {
             repeat_n(std.ln() + 0.5 * std::f32::consts::TAU.ln(), action_size).sum();
         let rows = actions
             .chunks_exact_mut(action_size)
-            .zip(means.chunks_exact(action_size));
-        let rows = rows.zip(observations.chunks_exact(observation_size));
+            .zip(means.chunks_exact(action_size))
+            .zip(observations.chunks_exact(observation_size));
         let figures = block.noise_scales[one.clone()]
             .iter_mut()
             .zip(&mut block.log_probs[one]);

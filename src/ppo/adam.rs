@@ -96,13 +96,11 @@ pub fn norm_chunks(groups: &[Range<usize>]) -> Vec<Range<usize>> {
 /// group.
 pub fn norm(squares: &[f64], groups: &[Range<usize>]) -> f64 {
     let mut squares = squares.iter();
-    let of_group = |group: &Range<usize>| {
-        squares
-            .by_ref()
-            .take(group.len().div_ceil(NORM_CHUNK))
-            .sum::<f64>()
-    };
-    groups.iter().map(of_group).sum::<f64>().sqrt()
+    let of_groups = groups.iter().map(|group| {
+        let chunks = group.len().div_ceil(NORM_CHUNK);
+        squares.by_ref().take(chunks).sum::<f64>()
+    });
+    of_groups.sum::<f64>().sqrt()
 }
 
 /// The sum of squares, added in lanes: in f32 within a lane, then in f64 over the lanes.
@@ -117,7 +115,7 @@ pub fn sum_of_squares(x: &[f32]) -> f64 {
                 .for_each(|(lane, x)| *lane += x * x);
         }
     });
-    lanes.iter().map(|&lane| f64::from(lane)).sum()
+    lanes.into_iter().map(f64::from).sum()
 }
 
 #[cfg(test)]

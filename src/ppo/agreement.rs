@@ -91,7 +91,14 @@ mod tests {
         let count = samples.len();
         let sums = ppo
             .backend
-            .gradients(&ppo.policy, rollout, &groups, count, &mut ppo.of_groups)
+            .gradients(
+                &ppo.policy,
+                &ppo.config,
+                rollout,
+                &groups,
+                count,
+                &mut ppo.of_groups,
+            )
             .unwrap();
         let add_up = |parameters, out: &mut [f32]| tree_sum(out, &ppo.of_groups, parameters);
         ppo.slices
@@ -257,7 +264,7 @@ mod tests {
             };
             let run = |threads: &[usize]| {
                 let (mut ppo, rollout) = learner(config::Backend::Fused, Activation::Tanh);
-                ppo.backend = Box::new(Fused::new(&ppo.config, arithmetic));
+                ppo.backend = Box::new(Fused::new(arithmetic));
                 ppo.backend.begin(&ppo.policy, &rollout);
                 let samples: Vec<u32> = (0..rollout.samples() as u32).collect();
                 let mut losses = Vec::new();

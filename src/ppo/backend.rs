@@ -82,6 +82,7 @@ pub trait GradientBackend: Send + Sync {
     fn gradients(
         &mut self,
         policy: &Policy,
+        config: &PpoConfig,
         rollout: &Rollout,
         groups: &[&[u32]],
         count: usize,

@@ -105,24 +105,20 @@ impl Checkpoint {
             .provenance
             .iter()
             .map(|text| ("provenance", text.as_str()));
-        let texts = always
-            .into_iter()
-            .chain(provenance)
-            .map(|(key, text)| (key.into(), text.into()))
-            .collect();
-        format::to_bytes(texts, &self.arrays)
+        let texts = always.into_iter().chain(provenance);
+        let texts = texts.map(|(key, text)| (key.into(), text.into()));
+        format::to_bytes(texts.collect(), &self.arrays)
     }
 
     /// Only the parts that playing needs. The path of a fork's checkpoint is left out. The path of an own scene stays in the
     /// settings, where it tells scenes apart.
     pub fn policy_alone(&self) -> Self {
-        let needed = |name: &str| {
+        let mut alone = self.clone();
+        alone.arrays.retain(|name, _| {
             ["actor.", "critic.", "normalizer.", LOG_STD]
                 .iter()
                 .any(|part| name.starts_with(part))
-        };
-        let mut alone = self.clone();
-        alone.arrays.retain(|name, _| needed(name));
+        });
         alone.progress.fork = None;
         alone
     }
@@ -195,8 +191,7 @@ impl Checkpoint {
     /// # Errors
     /// Fails if a tensor is missing or of another shape.
     pub fn expect_policy(&self, config: &PpoConfig, spaces: &Spaces) -> Result<()> {
-        let layout = ParameterLayout::new(&config.hidden, spaces);
-        layout
+        ParameterLayout::new(&config.hidden, spaces)
             .views()
             .iter()
             .try_for_each(|View { name, shape, .. }| self.expect(name, shape))?;
@@ -227,18 +222,15 @@ impl Checkpoint {
         let count = self.take_vector("normalizer.count", 1)?[0];
         let mean = self.take_vector("normalizer.mean", size)?;
         let variance = self.take_vector("normalizer.variance", size)?;
-        let sound = mean
-            .iter()
-            .chain(&variance)
-            .chain([&count])
-            .all(|x| x.abs() < 1e18);
         ensure!(
-            sound,
+            mean.iter()
+                .chain(&variance)
+                .chain([&count])
+                .all(|x| x.abs() < 1e18),
             "a tensor `normalizer.…` has a value that no observations can produce"
         );
-        let positive = count >= 0.0 && variance.iter().all(|&v| v >= 0.0);
         ensure!(
-            positive,
+            count >= 0.0 && variance.iter().all(|&v| v >= 0.0),
             "tensor `normalizer.variance` or `normalizer.count` has a negative value"
         );
         policy.normalizer = Normalizer {
@@ -279,8 +271,11 @@ impl Ppo {
     pub fn save(&self, checkpoint: &mut Checkpoint) {
         let vector = |values: &[f64]| Array::F64(vec![values.len()], values.to_vec());
         let adam = &self.adam;
-        let [mean, square] =
-            [&adam.mean, &adam.square].map(|moment| self.slices.all_gathered(moment));
+        let [mean, square] = [&adam.mean, &adam.square].map(|own| {
+            let mut moment = own.clone();
+            self.slices.all_gather(&mut moment);
+            moment
+        });
         let kinds = [
             ("", &self.policy.parameters[..]),
             ("adam.mean.", &mean),
@@ -321,16 +316,16 @@ impl Ppo {
         self.adam.mean = checkpoint.take_floats("adam.mean.", &views)?;
         self.adam.square = checkpoint.take_floats("adam.square.", &views)?;
         for View { name, range, .. } in views {
-            let sound = self.adam.square[range].iter().all(|&x| x >= 0.0);
-            ensure!(sound, "tensor `adam.square.{name}` has a negative value");
+            ensure!(
+                self.adam.square[range].iter().all(|&x| x >= 0.0),
+                "tensor `adam.square.{name}` has a negative value"
+            );
         }
-        let steps = checkpoint.take_counters("adam.steps")?;
         // The optimizer counts steps in 32 bits, enough for 2 · 10¹² environment steps of the default configuration.
-        ensure!(
-            steps.len() == 1 && steps[0] <= i32::MAX as u64,
-            "tensor `adam.steps` is not a step count"
-        );
-        self.adam.steps = steps[0];
+        match checkpoint.take_counters("adam.steps")?[..] {
+            [steps] if steps <= i32::MAX as u64 => self.adam.steps = steps,
+            _ => bail!("tensor `adam.steps` is not a step count"),
+        }
         self.learning_rate = checkpoint.take_vector("learning_rate", 1)?[0];
         ensure!(
             self.learning_rate > 0.0,

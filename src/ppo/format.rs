@@ -106,8 +106,7 @@ fn seal(mut texts: Texts, views: Vec<(String, TensorView)>) -> Result<Vec<u8>> {
     let mut parsed: serde_json::Map<String, serde_json::Value> = serde_json::from_slice(header)?;
     parsed
         .values_mut()
-        .filter_map(serde_json::Value::as_object_mut)
-        .for_each(serde_json::Map::sort_keys);
+        .for_each(serde_json::Value::sort_all_objects);
     let sorted = serde_json::to_vec(&parsed)?;
     header.fill(b' ');
     header[..sorted.len()].copy_from_slice(&sorted);
@@ -196,15 +195,15 @@ impl Array {
         let array = match view.dtype() {
             Dtype::F32 => Self::F32(
                 shape,
-                words.iter().map(|word| f32::from_le_bytes(*word)).collect(),
+                words.iter().copied().map(f32::from_le_bytes).collect(),
             ),
             Dtype::F64 => Self::F64(
                 shape,
-                longs.iter().map(|long| f64::from_le_bytes(*long)).collect(),
+                longs.iter().copied().map(f64::from_le_bytes).collect(),
             ),
             Dtype::U64 => Self::U64(
                 shape,
-                longs.iter().map(|long| u64::from_le_bytes(*long)).collect(),
+                longs.iter().copied().map(u64::from_le_bytes).collect(),
             ),
             other => bail!("has the type {other:?}, expected F32, F64 or U64"),
         };

@@ -22,7 +22,6 @@ use crate::config::PpoConfig;
 
 /// The gradient backend with our own kernels.
 pub struct Fused {
-    config: PpoConfig,
     arithmetic: Arithmetic,
     /// Workspaces, one per thread of the pool.
     workspaces: Vec<Mutex<Workspace>>,
@@ -39,10 +38,9 @@ type Job<'a> = (
 );
 
 impl Fused {
-    /// Creates the backend with these settings.
-    pub fn new(config: &PpoConfig, arithmetic: Arithmetic) -> Self {
+    /// Creates the backend.
+    pub fn new(arithmetic: Arithmetic) -> Self {
         Self {
-            config: config.clone(),
             arithmetic,
             workspaces: Vec::new(),
             seen: Vec::new(),
@@ -91,19 +89,21 @@ impl GradientBackend for Fused {
     fn gradients(
         &mut self,
         policy: &Policy,
+        config: &PpoConfig,
         rollout: &Rollout,
         groups: &[&[u32]],
         count: usize,
         gradients: &mut Vec<Vec<f32>>,
     ) -> Result<Vec<Losses>> {
-        let workspace = || Mutex::new(Workspace::new(&policy.layout.actor, ROWS, self.arithmetic));
         self.workspaces
-            .resize_with(rayon::current_num_threads(), workspace);
+            .resize_with(rayon::current_num_threads(), || {
+                Mutex::new(Workspace::new(&policy.layout.actor, ROWS, self.arithmetic))
+            });
         // The rows that pass through a net together: blocks of equal size as far as possible.
         let samples = groups.iter().map(|group| group.len()).max().unwrap_or(0);
         let rows = samples.div_ceil(samples.div_ceil(ROWS));
         let [actor, critic] = &policy.nets(self.arithmetic, true);
-        let loss = Loss::new(policy, rollout, count, &self.config);
+        let loss = Loss::new(policy, rollout, count, config);
         let [of_actor, _] = policy.layout.nets();
         gradients.resize_with(groups.len(), || vec![0.0; policy.layout.count()]);
         let mut jobs: Vec<Job> = Vec::new();

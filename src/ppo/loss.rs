@@ -111,7 +111,7 @@ impl<'a> Loss<'a> {
         let (surrogate, slope) = self.surrogate(ratio, block.advantages[i]);
         let error = (ratio - 1.0).abs();
         sums.surrogate += f64::from(surrogate);
-        sums.clipped += f64::from(u8::from(error > self.clip));
+        sums.clipped += f64::from(error > self.clip);
         sums.ratio_error = sums.ratio_error.max(f64::from(error));
         for ((sum, mean), old_mean) in squared_shifts.iter_mut().zip(mean).zip(&block.means[row]) {
             let shift = (mean - old_mean) * inverse_scale;

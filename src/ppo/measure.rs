@@ -56,13 +56,10 @@ pub fn time_gradient_steps(
 /// The matrix products of one forward and backward pass: sizes of weights `[outputs, inputs]`, and whether the
 /// gradient of the inputs is needed. It is not needed for observations.
 fn products(policy: &Policy) -> impl Iterator<Item = (usize, usize, bool)> {
-    let nets = [&policy.layout.actor, &policy.layout.critic];
-    nets.into_iter().flat_map(|layers| {
-        layers
-            .iter()
-            .enumerate()
-            .map(|(i, layer)| (layer.outputs, layer.inputs, i > 0))
-    })
+    [&policy.layout.actor, &policy.layout.critic]
+        .into_iter()
+        .flat_map(|layers| layers.iter().enumerate())
+        .map(|(i, layer)| (layer.outputs, layer.inputs, i > 0))
 }
 
 /// The number of floating-point operations of these products for one sample, both nets.

@@ -83,19 +83,16 @@ impl Ppo {
     pub fn new(config: &PpoConfig, spaces: Spaces, seed: u64, exchange: Exchange) -> Result<Self> {
         let policy = Policy::random(config, spaces, seed);
         let arithmetic = Arithmetic::new(config.precision)?;
-        let backend: Box<dyn GradientBackend> = match config.backend {
-            Backend::Fused => Box::new(Fused::new(config, arithmetic)),
-            Backend::Candle => Box::new(Reference {
-                config: config.clone(),
-            }),
-        };
         let count = policy.layout.count();
-        let slices = exchange.slices(norm_chunks(&policy.layout.nets()));
         Ok(Self {
+            slices: exchange.slices(norm_chunks(&policy.layout.nets())),
             config: config.clone(),
             seed,
             policy,
-            backend,
+            backend: match config.backend {
+                Backend::Fused => Box::new(Fused::new(arithmetic)),
+                Backend::Candle => Box::new(Reference),
+            },
             arithmetic,
             gradient: vec![0.0; count],
             of_groups: Vec::new(),
@@ -104,7 +101,6 @@ impl Ppo {
             env_steps: 0,
             actor_from: config.critic_first + 1,
             exchange,
-            slices,
         })
     }
 

@@ -42,9 +42,12 @@ impl Normalizer {
         let size = self.mean.len();
         let rows = exchange.of_all(arrays.iter().map(|array| array.len() / size).sum()) as f64;
         let mean_of = |f: fn(f64, f64) -> f64, means: &[f64]| -> Vec<f64> {
-            let sums = |arrays: &[&[f32]]| column_sums(arrays, means, &perceive, f);
             exchange
-                .sum(arrays, sums, add)
+                .sum(
+                    arrays,
+                    |arrays| column_sums(arrays, means, &perceive, f),
+                    add,
+                )
                 .into_iter()
                 .map(|total| total / rows)
                 .collect()
@@ -85,11 +88,10 @@ fn column_sums(
         });
         sums
     };
-    let tasks: Vec<&[f32]> = arrays
-        .iter()
-        .flat_map(|array| array.chunks(ROWS_PER_TASK * size))
-        .collect();
-    let partial: Vec<Vec<f64>> = tasks.into_par_iter().map(of_task).collect();
+    let tasks = arrays
+        .par_iter()
+        .flat_map(|array| array.par_chunks(ROWS_PER_TASK * size));
+    let partial: Vec<Vec<f64>> = tasks.map(of_task).collect();
     partial.into_iter().reduce(add).expect("a row")
 }
 

@@ -79,27 +79,17 @@ impl ParameterLayout {
     pub fn views(&self) -> Vec<View> {
         let mut views = Vec::new();
         for (net, layers) in [("actor", &self.actor), ("critic", &self.critic)] {
-            for (
-                i,
-                Layer {
-                    inputs,
-                    outputs,
-                    weight,
-                    bias,
-                },
-            ) in layers.iter().enumerate()
-            {
-                let weight_shape = vec![*outputs, *inputs];
-                views.push(View {
-                    name: format!("{net}.{i}.weight"),
-                    shape: weight_shape,
-                    range: weight.clone(),
-                });
-                views.push(View {
-                    name: format!("{net}.{i}.bias"),
-                    shape: vec![*outputs],
-                    range: bias.clone(),
-                });
+            for (i, layer) in layers.iter().enumerate() {
+                for (part, shape, range) in [
+                    ("weight", vec![layer.outputs, layer.inputs], &layer.weight),
+                    ("bias", vec![layer.outputs], &layer.bias),
+                ] {
+                    views.push(View {
+                        name: format!("{net}.{i}.{part}"),
+                        shape,
+                        range: range.clone(),
+                    });
+                }
             }
         }
         views

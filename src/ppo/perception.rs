@@ -59,7 +59,7 @@ impl Perception {
         let Some(ObjectAndGoal { object, goal, .. }) = self.object_and_goal else {
             return;
         };
-        let q = quaternion(observation, object);
+        let q = quat::read(observation, object);
         // The cosine of half the angle that remains to the unrotated orientation. All are computed first, so that the loop vectorises.
         let close = self
             .rotations
@@ -67,13 +67,8 @@ impl Perception {
         let best = self.rotations
             [(1..close.len()).fold(0, |best, i| if close[i] > close[best] { i } else { best })];
         for place in [object, goal] {
-            let turned = quat::mul(quaternion(observation, place), best);
-            let turned = if turned[0] < 0.0 {
-                turned.map(|x| -x)
-            } else {
-                turned
-            };
-            observation[place..place + 4].copy_from_slice(&turned);
+            let turned = quat::mul(quat::read(observation, place), best);
+            observation[place..place + 4].copy_from_slice(&quat::canonical(turned));
         }
     }
 
@@ -89,12 +84,6 @@ impl Perception {
             }
         });
     }
-}
-
-fn quaternion(observation: &[f32], place: usize) -> [f32; 4] {
-    *observation[place..]
-        .first_chunk()
-        .expect("an offset within the observation")
 }
 
 #[cfg(test)]
@@ -185,7 +174,7 @@ mod tests {
             let raw = observation(object, goal);
             let mut seen = raw.clone();
             perceive(&mut seen);
-            let [new_object, new_goal] = [5, 11].map(|at| quaternion(&seen, at));
+            let [new_object, new_goal] = [5, 11].map(|at| quat::read(&seen, at));
             let between = |a: [f32; 4], b: [f32; 4]| {
                 quat::mul(a.map(f64::from), quat::conj(b.map(f64::from)))
             };

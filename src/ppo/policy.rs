@@ -46,13 +46,11 @@ impl Policy {
     /// Creates a policy whose parameters are all zero, for environments with these spaces.
     pub fn new(config: &PpoConfig, spaces: Spaces) -> Self {
         let layout = ParameterLayout::new(&config.hidden, &spaces);
-        let parameters = vec![0.0; layout.count()];
-        let normalizer = Normalizer::new(spaces.observation_size);
         Self {
+            parameters: vec![0.0; layout.count()],
             layout,
-            parameters,
             log_std: 0.0,
-            normalizer,
+            normalizer: Normalizer::new(spaces.observation_size),
             activation: config.activation,
             spaces,
         }
@@ -75,8 +73,7 @@ impl Policy {
             .enumerate()
         {
             let bound = 1.0 / (layer.inputs as f32).sqrt();
-            let is_last_of_actor = i + 1 == policy.layout.actor.len();
-            let of_weights = if is_last_of_actor {
+            let of_weights = if i + 1 == policy.layout.actor.len() {
                 bound * LAST_ACTOR_LAYER
             } else {
                 bound
@@ -161,21 +158,16 @@ impl Policy {
         let width = frozen.nets[net].outputs();
         let rows = observations.len() / size;
         let mut results = vec![0.0; rows.next_multiple_of(GROUP) * width];
-        let group = |(seen, results): (&[f32], &mut [f32])| {
-            let mut padded = seen.to_vec();
-            padded.resize(GROUP * size, 0.0);
-            let mut outputs = [Default::default(), Default::default()];
-            outputs[net] = results;
-            frozen.compute(&padded, outputs, &mut frozen.workspace(GROUP));
-        };
-        if rows <= GROUP {
-            group((observations, &mut results));
-        } else {
-            observations
-                .par_chunks(GROUP * size)
-                .zip(results.par_chunks_mut(GROUP * width))
-                .for_each(group);
-        }
+        observations
+            .par_chunks(GROUP * size)
+            .zip(results.par_chunks_mut(GROUP * width))
+            .for_each(|(seen, results)| {
+                let mut padded = seen.to_vec();
+                padded.resize(GROUP * size, 0.0);
+                let mut outputs = [Default::default(), Default::default()];
+                outputs[net] = results;
+                frozen.compute(&padded, outputs, &mut frozen.workspace(GROUP));
+            });
         results.truncate(rows * width);
         results
     }

@@ -68,15 +68,14 @@ impl Rollout {
                 observation_size,
             }
         };
-        let blocks: Vec<RolloutBlock> = block_sizes.iter().map(block).collect();
-        let mut places = Vec::new();
-        for (i, block) in blocks.iter().enumerate() {
-            places.extend((0..block.samples() as u32).map(|row| (i as u32, row)));
-        }
+        let blocks: Vec<_> = block_sizes.iter().map(block).collect();
+        let numbered = blocks.iter().enumerate();
         Self {
             horizon,
+            places: numbered
+                .flat_map(|(i, block)| (0..block.samples() as u32).map(move |row| (i as u32, row)))
+                .collect(),
             blocks,
-            places,
         }
     }
 

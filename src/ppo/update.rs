@@ -2,7 +2,7 @@
 
 use std::f64::consts::{E, TAU};
 use std::iter::repeat_n;
-use std::ops::{Add, Range};
+use std::ops::Add;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use anyhow::{Context, Result, ensure};
@@ -92,8 +92,10 @@ impl Ppo {
             let size = self
                 .config
                 .minibatch_of(self.exchange.of_all(samples), rollout.horizon);
-            let stream = |shard| rng::stream(self.seed, "shuffle", iteration << 32 | shard as u64);
-            let shuffles = self.exchange.own_shards().map(stream).collect();
+            let own = self.exchange.own_shards();
+            let shuffles = own
+                .map(|shard| rng::stream(self.seed, "shuffle", iteration << 32 | shard as u64))
+                .collect();
             let mut minibatches = self.exchange.epochs(samples, size, shuffles);
             let mut steps = Vec::new();
             for epoch in 0..self.config.epochs {
@@ -113,15 +115,14 @@ impl Ppo {
                 }
             }
             for View { name, range, .. } in self.policy.layout.views() {
-                let finite = self.policy.parameters[range].iter().all(|x| x.is_finite());
                 ensure!(
-                    finite,
+                    self.policy.parameters[range].iter().all(|x| x.is_finite()),
                     "the update made `{name}` infinite or NaN: the training run has failed and stops here"
                 );
             }
             // The normaliser is part of the policy, which does not change while the critic learns alone.
             if !self.is_critic_alone(iteration) {
-                let seen: Vec<&[f32]> = rollout.blocks.iter().map(RolloutBlock::acted_on).collect();
+                let seen: Vec<_> = rollout.blocks.iter().map(RolloutBlock::acted_on).collect();
                 self.policy.see(&seen, &self.exchange);
             }
             Ok(Some(self.stats(&steps, explained_variance)))
@@ -156,14 +157,14 @@ impl Ppo {
     /// The mean and variance of one array over all samples of the update.
     fn mean_and_variance(&self, rollout: &Rollout, of: fn(&RolloutBlock) -> &[f32]) -> (f64, f64) {
         let sum = |term: &(dyn Fn(f64) -> f64 + Sync)| {
-            let of_blocks = |blocks: &[RolloutBlock]| {
-                blocks
-                    .iter()
-                    .flat_map(of)
-                    .map(|&x| term(f64::from(x)))
-                    .sum()
-            };
-            self.exchange.sum(&rollout.blocks, of_blocks, f64::add)
+            self.exchange.sum(
+                &rollout.blocks,
+                |blocks| {
+                    let values = blocks.iter().flat_map(of);
+                    values.map(|&x| term(f64::from(x))).sum()
+                },
+                f64::add,
+            )
         };
         let count = self.exchange.of_all(rollout.samples()) as f64;
         let mean = sum(&|x| x) / count;
@@ -183,16 +184,22 @@ impl Ppo {
         let nets = self.policy.layout.nets();
         let groups = self.exchange.groups(samples);
         let count = self.exchange.of_all(samples.len());
-        let sums =
-            self.backend
-                .gradients(&self.policy, rollout, &groups, count, &mut self.of_groups)?;
-        let add_up = |parameters: Range<usize>, out: &mut [f32]| match stage {
-            Stage::CriticAlone if parameters.start < nets[0].end => out.fill(0.0),
-            _ => tree_sum(out, &self.of_groups, parameters),
-        };
-        let squares = self
-            .slices
-            .reduce_scatter(&mut self.gradient, add_up, sum_of_squares);
+        let sums = self.backend.gradients(
+            &self.policy,
+            &self.config,
+            rollout,
+            &groups,
+            count,
+            &mut self.of_groups,
+        )?;
+        let squares = self.slices.reduce_scatter(
+            &mut self.gradient,
+            |parameters, out| match stage {
+                Stage::CriticAlone if parameters.start < nets[0].end => out.fill(0.0),
+                _ => tree_sum(out, &self.of_groups, parameters),
+            },
+            sum_of_squares,
+        );
         let grad_norm = norm(&squares, &nets);
         let losses = self.losses(&sums, count);
         for (what, value) in [
@@ -205,10 +212,12 @@ impl Ppo {
             );
         }
         if let Stage::Later = stage {
-            let range = self.config.learning_rate_range;
-            let desired_kl = self.config.desired_kl.at(self.env_steps);
-            self.learning_rate =
-                learning_rate::adapted(self.learning_rate, losses.kl, desired_kl, range);
+            self.learning_rate = learning_rate::adapted(
+                self.learning_rate,
+                losses.kl,
+                self.config.desired_kl.at(self.env_steps),
+                self.config.learning_rate_range,
+            );
         }
         // As in PyTorch's clip_grad_norm_, including the constant that prevents a division by zero.
         let scale = (self.config.max_grad_norm / (grad_norm + 1e-6)).min(1.0);
@@ -225,11 +234,9 @@ impl Ppo {
 
     /// The mean losses of a minibatch of `count` samples, given the sums of each group on this rank.
     pub fn losses(&self, sums: &[Losses], count: usize) -> Losses {
-        let of_shard =
-            |groups: &[Losses]| groups.iter().copied().reduce(Losses::add).expect("a group");
         let own = sums
             .chunks(sums.len() / self.exchange.own_shards().len())
-            .map(of_shard)
+            .map(|groups| groups.iter().copied().reduce(Losses::add).expect("a group"))
             .collect();
         self.exchange.in_order(own, Losses::add).means(count)
     }

@@ -29,15 +29,10 @@ impl Exchange {
                 "rank {rank} has another scene than rank 0"
             );
         }
-        let is_bound = |Machine {
-                            name,
-                            allowed,
-                            processors,
-                        }: &Machine| {
-            let here = all.iter().filter(|(.., other)| other.name == *name).count();
-            *allowed <= ONE_CORE && allowed * here < *processors
-        };
-        let bound = all.iter().position(|(.., machine)| is_bound(machine));
+        let bound = all.iter().position(|(.., own)| {
+            let here = all.iter().filter(|(.., other)| other.name == own.name);
+            own.allowed <= ONE_CORE && own.allowed * here.count() < own.processors
+        });
         Ok(bound.map(|rank| {
             let Machine { allowed, processors, .. } = all[rank].2;
             format!(

@@ -40,12 +40,10 @@ pub fn is_spokesman() -> bool {
 /// # Errors
 /// Fails if there are several.
 pub fn expect_one() -> Result<()> {
-    match launched() {
-        Some((_, size)) => {
-            bail!("only `train` runs on several ranks; {size} processes were started")
-        }
-        None => Ok(()),
+    if let Some((_, size)) = launched() {
+        bail!("only `train` runs on several ranks; {size} processes were started");
     }
+    Ok(())
 }
 
 fn told(variable: impl Fn(&str) -> Option<String>) -> Option<(usize, usize)> {
@@ -75,8 +73,8 @@ pub fn together(work: impl FnOnce(&Exchange) -> Result<ExitCode>) -> Result<Exit
         os::speak_as(&format!("rank {}", exchange.rank));
     }
     // Leaving the others means waiting for them, and they may be waiting for this one.
-    let result = caught(|| work(exchange)).unwrap_or_else(|panic| Err(anyhow!("panic: {panic}")));
-    result.or_else(|error| {
+    let result = caught(|| work(exchange)).map_err(|panic| anyhow!("panic: {panic}"));
+    result.flatten().or_else(|error| {
         if !exchange.is_first() {
             // An error that occurs on all ranks at once, such as a loss that is not finite, is reported by the first.
             std::thread::sleep(PATIENCE);

@@ -30,13 +30,14 @@ impl Exchange {
                 .chunks_mut(in_shard)
                 .zip(&mut shuffles)
                 .for_each(|(samples, rng)| samples.shuffle(rng));
-            let window = |part: usize| {
-                order
-                    .chunks(in_shard)
-                    .flat_map(move |shard| &shard[part * of_shard..][..of_shard])
-            };
             (0..in_shard / of_shard)
-                .map(|part| window(part).copied().collect())
+                .map(|part| {
+                    order
+                        .chunks(in_shard)
+                        .flat_map(|shard| &shard[part * of_shard..][..of_shard])
+                        .copied()
+                        .collect()
+                })
                 .collect()
         }
     }
@@ -50,9 +51,10 @@ impl Exchange {
         while groups > 1 && in_shard / groups < SMALLEST_GROUP {
             groups /= 2;
         }
-        let split =
-            |shard: &'a [u32]| (0..groups).map(move |group| &shard[part(in_shard, group, groups)]);
-        samples.chunks(in_shard).flat_map(split).collect()
+        samples
+            .chunks(in_shard)
+            .flat_map(|shard| (0..groups).map(move |group| &shard[part(in_shard, group, groups)]))
+            .collect()
     }
 }
 

@@ -25,14 +25,13 @@ impl Exchange {
     /// Deals these chunks of an array, which follow one another, to the ranks.
     pub fn slices(&self, chunks: Vec<Range<usize>>) -> Slices {
         let end = |count: usize| chunks[..count].last().map_or(0, |chunk| chunk.end);
-        let values = |rank| {
-            let dealt = part(chunks.len(), rank, self.size);
-            end(dealt.start)..end(dealt.end)
-        };
-        let all: Vec<Range<usize>> = (0..self.size).map(values).collect();
+        let of_rank = |rank| part(chunks.len(), rank, self.size);
+        let all: Vec<_> = (0..self.size)
+            .map(|rank| end(of_rank(rank).start)..end(of_rank(rank).end))
+            .collect();
         Slices {
             exchange: self.clone(),
-            dealt: self.own(chunks.len()),
+            dealt: of_rank(self.rank),
             own: all[self.rank].clone(),
             chunks,
             all,
@@ -50,22 +49,19 @@ impl Slices {
         sum: impl Fn(Range<usize>, &mut [f32]) + Sync,
         of: impl Fn(&[f32]) -> f64 + Sync,
     ) -> Vec<f64> {
+        let parts = split(numbers, &self.chunks).into_par_iter();
         if self.exchange.is_alone() {
-            let sum_and_of = |(chunk, out): (Range<usize>, &mut [f32])| {
-                sum(chunk, out);
-                of(out)
-            };
-            return split(numbers, &self.chunks)
-                .into_par_iter()
-                .map(sum_and_of)
+            return parts
+                .map(|(chunk, out)| {
+                    sum(chunk, out);
+                    of(out)
+                })
                 .collect();
         }
-        split(numbers, &self.chunks)
-            .into_par_iter()
-            .for_each(|(chunk, out)| sum(chunk, out));
+        parts.for_each(|(chunk, out)| sum(chunk, out));
         let parts = self.exchange.all_to_all(numbers, &self.all);
         // A rank without values has no chunks either, so the length does not matter.
-        let parts: Vec<&[f32]> = parts.chunks(self.own.len().max(1)).collect();
+        let parts: Vec<_> = parts.chunks(self.own.len().max(1)).collect();
         let add_and_of = |(chunk, out): (Range<usize>, &mut [f32])| {
             tree_sum(
                 out,
@@ -87,13 +83,6 @@ impl Slices {
     pub fn all_gather(&self, numbers: &mut [f32]) {
         self.exchange.all_gather_slices(numbers, &self.all);
     }
-
-    /// The values with the slices of all ranks.
-    pub fn all_gathered(&self, numbers: &[f32]) -> Vec<f32> {
-        let mut all = numbers.to_vec();
-        self.all_gather(&mut all);
-        all
-    }
 }
 
 /// Splits numbers into the chunks, which follow one another.
@@ -101,13 +90,13 @@ fn split<'a>(
     mut numbers: &'a mut [f32],
     chunks: &[Range<usize>],
 ) -> Vec<(Range<usize>, &'a mut [f32])> {
-    let next = |chunk: &Range<usize>| {
-        (
-            chunk.clone(),
-            numbers.split_off_mut(..chunk.len()).expect("room for all"),
-        )
-    };
-    chunks.iter().map(next).collect()
+    chunks
+        .iter()
+        .map(|chunk| {
+            let own = numbers.split_off_mut(..chunk.len());
+            (chunk.clone(), own.expect("room for all"))
+        })
+        .collect()
 }
 
 #[cfg(test)]

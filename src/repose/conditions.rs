@@ -1,6 +1,7 @@
 //! The conditions of an episode besides the task itself: the physics that it has drawn, forces and assistance on the object, delay
 //! and noise.
 
+use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use super::randomization::{EpisodePhysics, Randomization};
@@ -11,6 +12,7 @@ use crate::rng::{self, Rng};
 use crate::sim::Simulation;
 
 /// The conditions of the current episode of one environment.
+#[derive(Default)]
 pub struct Conditions {
     randomization: Option<Arc<Randomization>>,
     /// What the episode has drawn, if it is randomised.
@@ -19,18 +21,15 @@ pub struct Conditions {
     assisted: f64,
     /// Whether the last torque was not zero.
     twisted: bool,
-    /// What is added to the values of every observation of the episode, in the order of the values.
-    bias: Vec<(usize, f32)>,
+    /// What is added to the values of every observation of the episode, by the number of the value.
+    bias: BTreeMap<usize, f32>,
 }
 
 impl Conditions {
     pub fn new(randomization: Option<&Arc<Randomization>>) -> Self {
         Self {
             randomization: randomization.cloned(),
-            draw: None,
-            assisted: 0.0,
-            twisted: false,
-            bias: Vec::new(),
+            ..Self::default()
         }
     }
 
@@ -44,11 +43,7 @@ impl Conditions {
         self.assisted =
             (2.0 * rng::uniform(&mut rng::beside(rng, "assist"), 0.0, 1.0) - 1.0).max(0.0);
         self.twisted = false;
-        self.bias.clear();
-        sensing::combine(
-            &mut self.bias,
-            task.bias.draw(&mut rng::beside(rng, "bias")),
-        );
+        self.bias = task.bias.draw(&mut rng::beside(rng, "bias")).collect();
         let Some(randomization) = &self.randomization else {
             return;
         };
@@ -56,22 +51,15 @@ impl Conditions {
         sim.change_scene(scene, &changes);
         if self.draw.as_ref().is_some_and(|draw| draw.has_bias) {
             let rng = &mut rng::beside(rng, "bias of randomization");
-            sensing::combine(&mut self.bias, randomization.bias.draw(rng));
+            for (i, added) in randomization.bias.draw(rng) {
+                *self.bias.entry(i).or_default() += added;
+            }
         }
     }
 
     /// The control steps between an action and its effect.
     pub fn delay(&self, task: &Task) -> usize {
         (task.config.action_delay + self.draw.as_ref().map_or(0, EpisodePhysics::delay)) as usize
-    }
-
-    /// The largest delay of any episode.
-    pub fn most_delay(&self, task: &Task) -> u32 {
-        let drawn = self
-            .randomization
-            .as_ref()
-            .map_or(0, |randomization| randomization.config.delay[1]);
-        task.config.action_delay + drawn
     }
 
     /// Applies the random force on the object that belongs to a step (from 0) of the episode of `rng`, and returns it, N.
@@ -112,14 +100,13 @@ impl Conditions {
     /// Adds sensor noise for step `steps` and the constant offset of the episode that owns `rng`.
     pub fn disturb(&self, rng: &Rng, steps: u32, task: &Task, observation: &mut [f32]) {
         let drawn = self.randomization.as_ref().zip(self.draw.as_ref());
-        let spreads = [
-            Some(&task.noise),
-            drawn.and_then(|(randomization, draw)| randomization.noise(draw)),
-        ];
-        let noises = spreads
+        let of_draw = drawn
+            .filter(|(_, draw)| draw.has_noise)
+            .map(|(randomization, _)| &randomization.noise);
+        let noises = [Some(&task.noise), of_draw]
             .into_iter()
             .flatten()
-            .filter(|spread| !spread.is_empty());
+            .filter(|spread| !spread.0.is_empty());
         let mut noise_rng = None;
         for noise in noises {
             let rng = noise_rng.get_or_insert_with(|| rng::beside_at(rng, "noise", steps));

@@ -24,8 +24,8 @@ impl Diverged {
     /// in each step. In an episode with assistance, `torques` is the torque on the object in each step.
     pub fn as_json(&self, config: &EnvConfig, iteration: u64, env: usize) -> String {
         let tail = &self.tail;
-        let actions: Vec<&[f32]> = tail.actions.chunks_exact(tail.width).collect();
-        let ctrl: Vec<&[f64]> = tail.controls.chunks_exact(tail.width).collect();
+        let actions: Vec<_> = tail.actions.chunks_exact(tail.width).collect();
+        let ctrl: Vec<_> = tail.controls.chunks_exact(tail.width).collect();
         let mut dump = json!({
             "model": config.model,
             "goal_position": config.goal_position.value,

@@ -15,12 +15,12 @@ use super::randomization::{EpisodePhysics, Randomization};
 use super::reward::{Step, task_reward};
 use super::servos::Servos;
 use super::task::Task;
-use super::{EpisodeStats, Lesson, StepSums, TaskReward, TrainingReward, add};
+use super::{EpisodeStats, Lesson, StepSums, add};
 use crate::config::SuccessHold;
 use crate::env::{End, Env, EnvState, Resumable, SavedEnv, Transition};
 use crate::quat::{self, Quat};
 use crate::rng::{self, Rng};
-use crate::sim::{Actuator, Pose, Simulation};
+use crate::sim::{Pose, Simulation};
 use crate::spaces::Spaces;
 
 /// One Shadow Hand with its cube.
@@ -57,22 +57,20 @@ impl Repose {
 
     /// Creates an environment of `task` some of whose episodes are randomised.
     pub fn randomized(task: &Arc<Task>, randomization: Option<&Arc<Randomization>>) -> Self {
-        let conditions = Conditions::new(randomization);
-        let memory = conditions.most_delay(task).max(task.config.prediction) as usize;
+        let drawn_delay = randomization.map_or(0, |randomization| randomization.config.delay[1]);
+        let delay = task.config.action_delay + drawn_delay;
+        let memory = delay.max(task.config.prediction) as usize;
         let scene = randomization.map_or(&task.scene, |randomization| &randomization.nominal);
         Self {
             sim: Simulation::new(scene),
             servos: Servos::new(task.hand.actuators.len(), memory),
-            conditions,
+            conditions: Conditions::new(randomization),
             task: task.clone(),
             lesson: Lesson::task(&task.config),
             rng: rng::stream(0, "unused", 0),
-            goal: [1.0, 0.0, 0.0, 0.0],
+            goal: quat::IDENTITY,
             last: Step {
                 action: vec![0.0; task.hand.actuators.len()],
-                previous_action: vec![0.0; task.hand.actuators.len()],
-                joint_pos: vec![0.0; task.hand.joints.len()],
-                joint_vel: vec![0.0; task.hand.joints.len()],
                 ..Step::default()
             },
             age: 0,
@@ -109,19 +107,7 @@ impl Repose {
         quat::uniform([draw(), draw(), draw()])
     }
 
-    /// Clips the action, and writes as controls the targets that take effect now.
-    fn actuate(&mut self, action: &[f32]) {
-        let last = &mut self.last;
-        std::mem::swap(&mut last.previous_action, &mut last.action);
-        last.action
-            .iter_mut()
-            .zip(action)
-            .for_each(|(clipped, action)| *clipped = action.clamp(-1.0, 1.0));
-        self.servos
-            .apply(&last.action, &self.task.hand.actuators, &self.lesson);
-        self.send();
-    }
-
+    /// Writes as controls the targets that take effect now.
     fn send(&mut self) {
         let ctrl = self.sim.ctrl_mut();
         for (actuator, target) in self.task.hand.actuators.iter().zip(&self.servos.due) {
@@ -132,7 +118,14 @@ impl Repose {
     /// Takes one step of the physics under an action, and records what its rewards depend on.
     fn advance(&mut self, action: &[f32]) {
         let rot_dist_before = self.rot_dist();
-        self.actuate(action);
+        self.last
+            .action
+            .iter_mut()
+            .zip(action)
+            .for_each(|(clipped, action)| *clipped = action.clamp(-1.0, 1.0));
+        self.servos
+            .apply(&self.last.action, &self.task.hand.actuators, &self.lesson);
+        self.send();
         self.last.push =
             self.conditions
                 .push(&self.rng, self.episode.length, &mut self.sim, &self.task);
@@ -148,8 +141,8 @@ impl Repose {
             self.send();
         }
         self.measure(rot_dist_before);
-        self.last.reward = TaskReward::default();
-        self.last.training = TrainingReward::default();
+        self.last.reward = Default::default();
+        self.last.training = Default::default();
     }
 
     /// Rewards a step that did not diverge, and adds it to the sums.
@@ -193,24 +186,6 @@ impl Repose {
         self.held = 0;
         // The target may affect the physics of a custom scene, so nothing may depend on its old pose.
         self.sim.refresh();
-    }
-
-    fn restore_times(&mut self, [age, held]: [u64; 2]) -> Result<()> {
-        // `age` has no tighter limit: a fork may have shorter episodes.
-        let possible = age <= u64::from(u32::MAX / 2) && held <= age;
-        ensure!(
-            possible,
-            "impossible episode: at step {age} its goal has been held for {held} steps"
-        );
-        self.age = age as u32;
-        self.held = held as u32;
-        Ok(())
-    }
-
-    /// Decides whether the lesson replaces a goal that was not reached. The decision is random, so the state needs no clock.
-    fn gives_up(&mut self) -> bool {
-        let chance = self.lesson.redirect_chance;
-        chance > 0.0 && rng::uniform(&mut self.rng, 0.0, 1.0) < chance
     }
 }
 
@@ -256,18 +231,13 @@ impl Env for Repose {
             self.sim.qpos_mut()[hand.object.qpos + axis] = start + noise;
         }
         let orientation = self.draw_rotation();
-        self.sim.qpos_mut()[hand.object.qpos + 3..hand.object.qpos + 7]
-            .copy_from_slice(&orientation);
+        self.sim.qpos_mut()[hand.object.qpos + 3..][..4].copy_from_slice(&orientation);
         self.replace_goal();
-        let target = |actuator: &Actuator| {
-            self.sim
-                .length(*actuator)
-                .clamp(actuator.range[0], actuator.range[1])
-        };
-        self.servos.reset(
-            hand.actuators.iter().map(target),
-            self.conditions.delay(&self.task),
-        );
+        let targets = hand.actuators.iter().map(|actuator| {
+            let [low, high] = actuator.range;
+            self.sim.length(*actuator).clamp(low, high)
+        });
+        self.servos.reset(targets, self.conditions.delay(&task));
         self.send();
         self.last.action.fill(0.0);
         self.age = 0;
@@ -307,10 +277,12 @@ impl Env for Repose {
             Some(End::Terminated)
         } else {
             let time_is_up = self.age >= self.task.config.max_episode_steps();
+            let chance = self.lesson.redirect_chance;
             let goal_ends = if reached {
                 self.lesson.goals_end
             } else {
-                self.gives_up()
+                // A goal that was not reached is given up at random, so the state needs no clock.
+                chance > 0.0 && rng::uniform(&mut self.rng, 0.0, 1.0) < chance
             };
             time_is_up
                 .then_some(End::Truncated)
@@ -321,9 +293,8 @@ impl Env for Repose {
             self.replace_goal();
         }
         self.show(observation);
-        let reward = self.lesson.total(self.last.reward, self.last.training);
         Transition {
-            reward: reward as f32,
+            reward: self.lesson.total(self.last.reward, self.last.training) as f32,
             end,
         }
     }
@@ -356,8 +327,14 @@ impl Resumable for Repose {
 
     fn restore(&mut self, state: &mut SavedEnv, observation: &mut [f32]) -> Result<()> {
         self.rng = rng::at(state.counters()?);
-        self.restore_times(state.counters()?)?;
-        let [randomized] = state.counters()?;
+        let [age, held, randomized] = state.counters()?;
+        // `age` has no tighter limit: a fork may have shorter episodes.
+        ensure!(
+            age <= u64::from(u32::MAX / 2) && held <= age,
+            "impossible episode: at step {age} its goal has been held for {held} steps"
+        );
+        self.age = age as u32;
+        self.held = held as u32;
         ensure!(
             randomized <= 1,
             "the mark of a randomised episode is {randomized}, not 0 or 1"
@@ -380,13 +357,9 @@ impl Resumable for Repose {
             .iter_mut()
             .zip(state.next(actuators)?)
             .for_each(|(own, x)| *own = *x as f32);
-        let clipped = self
-            .last
-            .action
-            .iter()
-            .all(|action| (-1.0..=1.0).contains(action));
+        let mut actions = self.last.action.iter();
         ensure!(
-            clipped,
+            actions.all(|action| (-1.0..=1.0).contains(action)),
             "the previous action is outside [-1, 1]: {:?}",
             self.last.action
         );

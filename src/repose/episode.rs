@@ -51,10 +51,8 @@ impl EpisodeStats {
         let [rot_dist_sum] = state.numbers()?;
         let reward = state.numbers()?;
         let [length, goals, in_tolerance, dropped, diverged] = state.counters()?;
-        let possible =
-            length <= u64::from(u32::MAX / 2) && goals <= length && in_tolerance <= length;
         ensure!(
-            possible,
+            length <= u64::from(u32::MAX / 2) && goals <= length && in_tolerance <= length,
             "impossible episode: {length} steps, {goals} goals, {in_tolerance} steps in tolerance"
         );
         let [length, goals, in_tolerance] = [length, goals, in_tolerance].map(|count| count as u32);

@@ -1,6 +1,6 @@
 //! The hand in a scene: its parts in the task's order, bound once, and the layout of observations that follows from them.
 
-use anyhow::{Result, bail, ensure};
+use anyhow::{Error, Result, bail, ensure};
 
 use super::observation::Layout;
 use crate::sim::{Actuator, Body, Frame, FreeJoint, Hinge, Mocap, Parts, Scene};
@@ -66,7 +66,7 @@ impl Hand {
                 }
             }
         }
-        scene.find_parts(&parts)
+        scene.find_parts(parts)
     }
 
     /// Binds these parts of `scene`, all of which are named but for the start.
@@ -82,24 +82,19 @@ impl Hand {
             &mut problems,
         );
         let fingertips = each(&parts.fingertips, |tip| scene.frame(tip), &mut problems);
-        let object = scene
-            .free_body(&parts.object)
-            .map_err(|error| problems.push(error.to_string()));
-        let goal = scene
-            .mocap(&parts.goal)
-            .map_err(|error| problems.push(error.to_string()));
-        let keyframe = scene
-            .start(&parts.start)
-            .map_err(|error| problems.push(error.to_string()));
+        let mut note = |error: Error| problems.push(error.to_string());
+        let object = scene.free_body(&parts.object).map_err(&mut note);
+        let goal = scene.mocap(&parts.goal).map_err(&mut note);
+        let keyframe = scene.start(&parts.start).map_err(&mut note);
         let driven: Vec<_> = actuators
             .iter()
             .map(|&actuator| scene.driven(actuator))
             .collect();
-        let refused = driven
-            .iter()
-            .flatten()
-            .filter_map(|(joint, _)| scene.hinge(joint).err());
-        problems.extend(refused.map(|error| error.to_string()));
+        for (joint, _) in driven.iter().flatten() {
+            if let Err(error) = scene.hinge(joint) {
+                note(error);
+            }
+        }
         problems.sort();
         problems.dedup();
         let (Ok(object), Ok(goal), Ok(keyframe), []) = (object, goal, keyframe, &problems[..])
@@ -112,21 +107,18 @@ impl Hand {
             "has {controls} controls, but it must have exactly the {} of the hand",
             actuators.len()
         );
-        let roots = roots(scene, &parts, &fingertips)?;
-        let start = scene.pose_of(keyframe);
-        let layout = Layout::new(joints.len(), fingertips.len(), actuators.len());
         Ok(Self {
+            roots: roots(scene, &parts, &fingertips)?,
+            start: scene.pose_of(keyframe),
+            layout: Layout::new(joints.len(), fingertips.len(), actuators.len()),
             parts,
             joints,
             actuators,
             driven,
             fingertips,
-            roots,
             object,
             goal,
             keyframe,
-            start,
-            layout,
         })
     }
 
@@ -140,12 +132,12 @@ impl Hand {
     /// The prefix of its names if it has the names of the Shadow Hand.
     pub fn side(&self) -> Option<&str> {
         let prefix = self.parts.joints.first()?.strip_suffix(JOINTS[0])?;
-        let names = self
-            .parts
+        self.parts
             .joints
             .iter()
-            .map(|name| name.strip_prefix(prefix));
-        names.eq(JOINTS.map(Some)).then_some(prefix)
+            .map(|name| name.strip_prefix(prefix))
+            .eq(JOINTS.map(Some))
+            .then_some(prefix)
     }
 }
 
@@ -156,7 +148,7 @@ fn shadow_hand(scene: &Scene) -> Option<Parts> {
 
     let with =
         |names: &[&str], prefix: &str| names.iter().map(|name| format!("{prefix}{name}")).collect();
-    let mut hands = joints
+    joints
         .iter()
         .filter_map(|name| name.strip_suffix(JOINTS[0]))
         .map(|prefix| Parts {
@@ -164,12 +156,12 @@ fn shadow_hand(scene: &Scene) -> Option<Parts> {
             actuators: with(&ACTUATORS, &format!("{prefix}A_")),
             fingertips: with(&FINGERTIPS, prefix),
             ..Parts::default()
-        });
-    hands.find(|hand| {
-        hand.joints.iter().all(|name| joints.contains(name))
-            && hand.actuators.iter().all(|name| actuators.contains(name))
-            && hand.fingertips.iter().all(|name| scene.body(name).is_ok())
-    })
+        })
+        .find(|hand| {
+            hand.joints.iter().all(|name| joints.contains(name))
+                && hand.actuators.iter().all(|name| actuators.contains(name))
+                && hand.fingertips.iter().all(|name| scene.body(name).is_ok())
+        })
 }
 
 /// The first bodies of the trees that carry these fingertips.
@@ -194,17 +186,15 @@ fn each<T>(
     find: impl Fn(&str) -> Result<T>,
     problems: &mut Vec<String>,
 ) -> Vec<T> {
-    let twice = names
-        .iter()
-        .enumerate()
-        .filter(|(i, name)| names[..*i].contains(name));
-    problems.extend(twice.map(|(_, name)| format!("`{name}` is named twice")));
-    names
-        .iter()
-        .filter_map(|name| {
-            find(name)
-                .map_err(|error| problems.push(error.to_string()))
-                .ok()
-        })
-        .collect()
+    let mut found = Vec::new();
+    for (i, name) in names.iter().enumerate() {
+        if names[..i].contains(name) {
+            problems.push(format!("`{name}` is named twice"));
+        }
+        match find(name) {
+            Ok(part) => found.push(part),
+            Err(error) => problems.push(error.to_string()),
+        }
+    }
+    found
 }

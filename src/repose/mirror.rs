@@ -21,11 +21,6 @@ pub struct Mirror {
     tips: Vec<(usize, Quat)>,
 }
 
-/// The mirrored rotation: its axis is mirrored like a point, and its sense is the opposite one.
-fn mirrored([w, x, y, z]: Quat) -> Quat {
-    [w, -x, y, -z]
-}
-
 impl Mirror {
     /// The mirror from the hand of `here` to the hand of `policy`.
     ///
@@ -35,13 +30,13 @@ impl Mirror {
         // Returns how far a fingertip is from its counterpart on the other hand in a recorded pose, and the rotation
         // between the two.
         let compare = |at: usize| {
-            let [x, y, z, own @ ..] = here.tips[at];
+            let [x, y, z, qw, qx, qy, qz] = here.tips[at];
             let [a, b, c, other @ ..] = policy.tips[at];
-            let apart = [x - a, -y - b, z - c]
-                .into_iter()
-                .map(f64::abs)
-                .fold(0.0, f64::max);
-            (apart, quat::mul(quat::conj(mirrored(own)), other))
+            let apart = [x - a, y + b, z - c].map(f64::abs);
+            // The axis of a mirrored rotation is mirrored like a point, and its sense is the opposite one.
+            let mirrored = [qw, -qx, qy, -qz];
+            let between = quat::mul(quat::conj(mirrored), other);
+            (apart.into_iter().fold(0.0, f64::max), between)
         };
         let mut tips = Vec::new();
         for (i, start) in layout.tips().enumerate() {
@@ -67,10 +62,8 @@ impl Mirror {
     /// The mirror between hands whose names do not tell that they are on different sides, if the fingertips are in the same places only in
     /// the mirror.
     pub fn by_fingertips(here: &Record, policy: &Record, layout: &Layout) -> Option<Self> {
-        let is_near =
-            |(a, b): (&[f64; 7], &[f64; 7])| (0..3).all(|i| (a[i] - b[i]).abs() <= TOLERANCE);
-        let is_same = here.tips.iter().zip(&policy.tips).all(is_near);
-        if is_same {
+        let mut tips = here.tips.iter().zip(&policy.tips);
+        if tips.all(|(a, b)| (0..3).all(|i| (a[i] - b[i]).abs() <= TOLERANCE)) {
             None
         } else {
             Self::new(here, policy, layout).ok()
@@ -83,8 +76,7 @@ impl Mirror {
             .iter()
             .for_each(|&i| observation[i] = -observation[i]);
         for &(at, turn) in &self.tips {
-            let own: [f32; 4] = *observation[at..].first_chunk().expect("an orientation");
-            let turned = quat::mul(own, turn.map(|x| x as f32));
+            let turned = quat::mul(quat::read(observation, at), turn.map(|x| x as f32));
             observation[at..at + 4].copy_from_slice(&turned);
         }
     }

@@ -1,6 +1,7 @@
 //! The layout of an observation: one table from which sizes, offsets and the descriptions for other modules follow.
 
-use crate::quat;
+use std::ops::Range;
+
 use crate::spaces::{ObjectAndGoal, Spaces};
 use Sensing::{Known, Measured};
 
@@ -52,6 +53,13 @@ pub struct Layout {
     pub size: usize,
     /// The number of values in an action.
     pub actions: usize,
+}
+
+impl Group {
+    /// The places of its values in an observation.
+    pub(super) fn cells(&self) -> Range<usize> {
+        self.start..self.start + self.length
+    }
 }
 
 impl Layout {
@@ -119,23 +127,19 @@ impl Layout {
 
     /// The indices of the first values of the fingertips.
     pub(super) fn tips(&self) -> impl Iterator<Item = usize> {
-        let Group { start, length, .. } = self.groups[TIPS];
-        (start..start + length).step_by(TIP_SIZE)
+        self.groups[TIPS].cells().step_by(TIP_SIZE)
     }
 
     /// The indices of the values that change their sign in the mirror, the plane y = 0 of the world.
     pub(super) fn mirrored(&self) -> Vec<usize> {
         // No other group in which something changes is longer than one fingertip.
-        let of_group = |Group {
-                            start,
-                            length,
-                            mirrored,
-                            ..
-                        }: Group| {
-            let parts = (start..start + length).step_by(TIP_SIZE);
-            parts.flat_map(move |part| mirrored.iter().map(move |i| part + i))
-        };
-        self.groups.into_iter().flat_map(of_group).collect()
+        let mut all = Vec::new();
+        for group in self.groups {
+            for part in group.cells().step_by(TIP_SIZE) {
+                all.extend(group.mirrored.iter().map(|i| part + i));
+            }
+        }
+        all
     }
 
     /// The description of observations and actions for a learner, for an object with these rotations.
@@ -149,7 +153,7 @@ impl Layout {
                 object,
                 goal,
                 relative,
-                rotations: quat::mask(rotations),
+                rotations: rotations.iter().fold(0, |mask, i| mask | 1 << i),
             }),
             distance: rotation_error,
         }
@@ -184,16 +188,15 @@ impl<'a> Writer<'a> {
     /// Writes the next values, which must belong to the group `name`. This is the only place where the doubles of the physics
     /// become the floats of the learner.
     pub fn put(&mut self, name: &str, values: impl IntoIterator<Item = f64>) {
-        let Group {
-            name: expected,
-            start,
-            length,
-            ..
-        } = self.layout.groups[self.part];
-        let end = start + length;
-        assert!(name == expected, "{name}: {expected} comes first");
+        let group = &self.layout.groups[self.part];
+        let Range { end, .. } = group.cells();
+        assert!(name == group.name, "{name}: {} comes first", group.name);
         for value in values {
-            assert!(self.written < end, "{name}: more than {length} values");
+            assert!(
+                self.written < end,
+                "{name}: more than {} values",
+                group.length
+            );
             self.cells[self.written] = value as f32;
             self.written += 1;
         }

@@ -5,7 +5,7 @@ use std::ops::Index;
 
 use rand::RngExt;
 use rand_distr::{Distribution, StandardNormal};
-use serde_json::{Map, Value, json};
+use serde_json::{Value, json};
 use toml::Table;
 
 use super::hand::Hand;
@@ -161,12 +161,12 @@ impl Quantity {
 
 /// The factors on the lengths of the object that are drawn.
 pub fn sizes([low, high]: [f64; 2]) -> Vec<f64> {
-    let place = |i: usize| low + (high - low) * i as f64 / (SIZES - 1) as f64;
     if low == high {
-        vec![low]
-    } else {
-        (0..SIZES).map(place).collect()
+        return vec![low];
     }
+    (0..SIZES)
+        .map(|i| low + (high - low) * i as f64 / (SIZES - 1) as f64)
+        .collect()
 }
 
 pub fn normal(rng: &mut Rng, std: f64) -> f64 {
@@ -200,26 +200,25 @@ impl Physics {
 
     /// What it changes in a scene.
     pub(super) fn changes(&self, hand: &Hand) -> Vec<Change> {
-        let differ = QUANTITIES
+        QUANTITIES
             .iter()
             .zip(&self.0)
-            .filter(|(of, values)| values.iter().any(|x| *x != of.neutral()));
-        differ
+            .filter(|(of, values)| values.iter().any(|x| *x != of.neutral()))
             .flat_map(|(quantity, values)| (quantity.change)(hand, values))
             .collect()
     }
 
     /// The values by name, as a dump reports them.
     pub(super) fn as_json(&self) -> Value {
-        let value = |(quantity, values): (&Quantity, &Vec<f64>)| {
-            let value = match quantity.law {
+        let mut object = json!({});
+        for (quantity, values) in QUANTITIES.iter().zip(&self.0) {
+            object[quantity.name] = match quantity.law {
                 Law::Whole(_) => json!(values[0] as u64),
                 Law::Uniform(_) | Law::Size(_) => json!(values[0]),
                 _ => json!(values),
             };
-            (quantity.name.to_owned(), value)
-        };
-        Map::from_iter(QUANTITIES.iter().zip(&self.0).map(value)).into()
+        }
+        object
     }
 }
 
@@ -253,11 +252,10 @@ pub fn physical(config: &EnvConfig) -> Table {
 /// Adds to a JSON object the settings of a task that vary its physics, what is observed, and when actions take effect.
 pub fn add_settings(config: &EnvConfig, object: &mut Value) {
     let table = Table::try_from(config).expect("settings are a table");
-    let names = QUANTITIES
-        .iter()
-        .map(|quantity| quantity.setting)
-        .chain(OTHERS);
-    names.for_each(|name| object[name] = json!(table[name]));
+    let settings = QUANTITIES.iter().map(|quantity| quantity.setting);
+    for name in settings.chain(OTHERS) {
+        object[name] = json!(table[name]);
+    }
 }
 
 #[cfg(test)]

@@ -1,6 +1,6 @@
 //! Where the hand will be when an action takes effect: a model of it runs forward through the targets that are still on their way.
 
-use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use anyhow::{Result, ensure};
 
@@ -8,7 +8,7 @@ use super::hand::Hand;
 use crate::config::EnvConfig;
 use crate::os::shortened;
 use crate::quat;
-use crate::sim::{Pose, Scene, Simulation};
+use crate::sim::{Pose, Scene, Simulation, origin};
 
 /// A model of the hand that predicts what will be observed.
 pub struct Predictor {
@@ -21,23 +21,27 @@ pub struct Predictor {
 }
 
 impl Predictor {
-    /// Prepares the prediction of what happens in this scene.
+    /// Prepares the prediction of what happens in this scene, or nothing if nothing is predicted.
     ///
     /// # Errors
     /// Fails if the observation does not hold the whole state of the scene.
-    pub fn new(scene: &Scene, hand: &Hand, config: &EnvConfig) -> Result<Self> {
+    pub fn new(scene: &Scene, hand: &Hand, config: &EnvConfig) -> Result<Option<Arc<Self>>> {
+        if config.prediction == 0 {
+            return Ok(None);
+        }
         let unseen = scene.joints_besides(&hand.joints, &hand.object);
         ensure!(
             unseen.is_empty(),
-            "env.prediction = {}: a policy does not observe {}, so their movement cannot be predicted",
+            "{}: env.prediction = {}: a policy does not observe {}, so their movement cannot be predicted",
+            origin(config.model_file()),
             config.prediction,
             shortened(&unseen.join(", "))
         );
-        Ok(Self {
+        Ok(Some(Arc::new(Self {
             scene: scene.clone(),
             config: config.clone(),
             idle: Mutex::default(),
-        })
+        })))
     }
 
     /// Runs from a measured observation `[O]` of `hand` through `targets`: one for each actuator, one control step after another.

@@ -20,9 +20,9 @@ pub struct Randomization {
     pub(super) config: RandomizationConfig,
     /// The scene of the episodes that are not randomised. It has the physics of the task.
     pub nominal: Scene,
-    /// The scenes with another size of the object, each behind the factor on its lengths. The last one is the nominal scene.
+    /// The scenes with another size of the object, each behind the factor on its lengths. The first one is the nominal scene.
     scenes: Vec<(f64, Scene)>,
-    noise: NoiseStd,
+    pub(super) noise: NoiseStd,
     pub(super) bias: NoiseStd,
 }
 
@@ -64,32 +64,21 @@ impl Randomization {
         } else {
             task.scene.clone()
         };
-        let mut sizes = sizes(config.cube_size);
-        sizes.push(1.0);
-        let scene = |size| {
-            Ok((
-                size,
-                if size == 1.0 {
-                    nominal.clone()
-                } else {
-                    task.scene_with(size, shifts)?
-                },
-            ))
-        };
-        let scenes = sizes
-            .into_iter()
-            .map(scene)
-            .collect::<Result<Vec<_>>>()
-            .context("randomization.cube_size")?;
-        let alike = scenes
-            .iter()
-            .all(|(_, scene)| scene.has_structure_of(&nominal));
-        let file = || origin(task.config.model_file());
-        ensure!(
-            alike,
-            "{}: its structure changes with the size of the object",
-            file()
-        );
+        let mut scenes = vec![(1.0, nominal.clone())];
+        for size in sizes(config.cube_size) {
+            if size == 1.0 {
+                continue;
+            }
+            let scene = task
+                .scene_with(size, shifts)
+                .context("randomization.cube_size")?;
+            ensure!(
+                scene.has_structure_of(&nominal),
+                "{}: its structure changes with the size of the object",
+                origin(task.config.model_file())
+            );
+            scenes.push((size, scene));
+        }
         Ok(Some(Arc::new(Self {
             config: config.clone(),
             nominal,
@@ -139,11 +128,6 @@ impl Randomization {
             .find(|(size, _)| physics["cube_size"] == [*size]);
         let (_, scene) = sized.expect("a size that can be drawn, or the nominal one");
         (scene, physics.changes(hand))
-    }
-
-    /// The noise on the observations of an episode, if there is any.
-    pub(super) fn noise(&self, draw: &EpisodePhysics) -> Option<&NoiseStd> {
-        Some(&self.noise).filter(|_| draw.has_noise)
     }
 
     /// The force on the object, N, in a step (from 0) of the episode of `rng`, or `None` if it has none.

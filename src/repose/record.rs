@@ -10,7 +10,7 @@ use super::observation::Layout;
 use crate::config::Symmetry;
 use crate::os::shortened;
 use crate::quat::CUBE_ROTATIONS;
-use crate::sim::{Frame, Parts, Pose, Scene, Simulation};
+use crate::sim::{Parts, Scene, Simulation};
 use crate::spaces::Spaces;
 
 /// The most bytes of a record that are read. The record of the Shadow Hand has three thousand.
@@ -47,22 +47,17 @@ impl Record {
             fingertips,
             ..
         } = hand.parts.clone();
-        let ranges = hand
-            .actuators
-            .iter()
-            .map(|actuator| actuator.range)
-            .collect();
+        let ranges = hand.actuators.iter().map(|actuator| actuator.range);
         let tips = POSES
             .iter()
-            .flat_map(|fractions| tips_at(hand, scene, fractions))
-            .collect();
+            .flat_map(|fractions| tips_at(hand, scene, fractions));
         Self {
             joints,
             actuators,
-            ranges,
+            ranges: ranges.collect(),
             driven: hand.driven.clone(),
             fingertips,
-            tips,
+            tips: tips.collect(),
             symmetry,
         }
     }
@@ -77,18 +72,17 @@ impl Record {
             "its metadata `hand` has {} bytes; at most {LONGEST} are read",
             text.len()
         );
-        let record = serde_json::from_str::<Self>(text);
-        let record = record
+        let record: Self = serde_json::from_str(text)
             .map_err(|error| anyhow!("its metadata `hand`: {}", shortened(&error.to_string())))?;
         let actuators = record.actuators.len();
         let tips = POSES.len() * record.fingertips.len();
         let sizes = [record.ranges.len(), record.driven.len(), record.tips.len()];
-        let fits =
-            sizes == [actuators, actuators, tips] && !record.joints.is_empty() && actuators > 0;
-        let symmetry = record.symmetry.first() == Some(&0)
-            && record.symmetry.iter().all(|&rotation| rotation < 24);
         ensure!(
-            fits && symmetry,
+            sizes == [actuators, actuators, tips]
+                && !record.joints.is_empty()
+                && actuators > 0
+                && record.symmetry.first() == Some(&0)
+                && record.symmetry.iter().all(|&rotation| rotation < 24),
             "its metadata `hand` has lists of other lengths than its hand needs"
         );
         Ok(record)
@@ -140,11 +134,10 @@ impl Record {
                 differ.push(format!("{} {what}s, not {}", found.len(), own.len()));
                 continue;
             }
-            for (own, found) in own
-                .iter()
-                .zip(found)
-                .filter(|(own, found)| !is_named(found, own))
-            {
+            for (own, found) in own.iter().zip(found) {
+                if is_named(found, own) {
+                    continue;
+                }
                 if is_other_side(found, own) {
                     is_other_hand = true;
                 } else {
@@ -164,20 +157,22 @@ impl Record {
     pub(super) fn warning(&self, there: &Self) -> Option<String> {
         // In whatever order a tendon has its joints.
         let sum = |of: &Self, i: usize| -> BTreeSet<_> {
-            let place = |name: &String| of.joints.iter().position(|joint| joint == name);
             let driven = of.driven[i].iter();
             driven
-                .map(|(name, coefficient)| (place(name), coefficient.to_bits()))
+                .map(|(name, coefficient)| {
+                    let place = of.joints.iter().position(|joint| joint == name);
+                    (place, coefficient.to_bits())
+                })
                 .collect()
         };
-        let apart = |i: &usize| {
-            let mut ends = self.ranges[*i].iter().zip(there.ranges[*i]);
-            ends.any(|(own, found)| (own - found).abs() > 1e-4) || sum(self, *i) != sum(there, *i)
-        };
-        let others: Vec<&str> = (0..self.ranges.len())
-            .filter(apart)
-            .map(|i| &*there.actuators[i])
-            .collect();
+        let mut others = Vec::new();
+        for (i, name) in there.actuators.iter().enumerate() {
+            let mut ends = self.ranges[i].iter().zip(there.ranges[i]);
+            if ends.any(|(own, found)| (own - found).abs() > 1e-4) || sum(self, i) != sum(there, i)
+            {
+                others.push(name.as_str());
+            }
+        }
         (!others.is_empty()).then(|| {
             let names = shortened(&others.join(" "));
             format!("an action means another angle than in training: the ranges or the tendons of {names} differ")
@@ -211,12 +206,12 @@ fn tips_at(hand: &Hand, scene: &Scene, fractions: &[f64]) -> Vec<[f64; 7]> {
         sim.qpos_mut()[joint.qpos] = joint.range[0] + fraction * (joint.range[1] - joint.range[0]);
     }
     sim.refresh();
-    let pose = |tip: &Frame| {
-        let Pose {
-            position: [x, y, z],
-            orientation: [qw, qx, qy, qz],
-        } = sim.pose(*tip);
-        [x, y, z, qw, qx, qy, qz]
-    };
-    hand.fingertips.iter().map(pose).collect()
+    let poses = hand.fingertips.iter().map(|&tip| sim.pose(tip));
+    poses
+        .map(|pose| {
+            let [x, y, z] = pose.position;
+            let [qw, qx, qy, qz] = pose.orientation;
+            [x, y, z, qw, qx, qy, qz]
+        })
+        .collect()
 }

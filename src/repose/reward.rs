@@ -2,9 +2,8 @@
 //!
 //! A term is one row. Its column in `metrics.csv`, its tag, its sums and its description follow from that row.
 
-use crate::config::{EnvConfig, Ramp, TrainingConfig};
+use crate::config::{EnvConfig, TrainingConfig};
 use crate::quat::Quat;
-use crate::sim::{Pose, Velocity};
 
 /// A control step after its physics: what its rewards may depend on, and what they are. SI units and rad, in the world frame.
 #[derive(Clone, Debug, Default)]
@@ -23,16 +22,6 @@ pub struct Step {
     pub dropped: bool,
     /// The action, clipped to [-1, 1].
     pub action: Vec<f32>,
-    /// The action of the step before, clipped. Zeros after a reset.
-    pub previous_action: Vec<f32>,
-    /// The pose of the object.
-    pub object: Pose,
-    /// The velocity of the object's centre.
-    pub object_velocity: Velocity,
-    /// The angles of the joints, in observation order.
-    pub joint_pos: Vec<f64>,
-    /// The velocities of the joints, in observation order.
-    pub joint_vel: Vec<f64>,
     /// The random force on the object, if there are such forces in the episode.
     pub push: Option<[f64; 3]>,
     /// Whether the physics diverged. Then nothing above but the goal and the actions has a meaning, and there is no reward.
@@ -50,15 +39,14 @@ pub struct Description(pub &'static str, pub &'static str);
 /// A term of the task's reward, and its value in a step.
 struct TaskTerm(Description, fn(&EnvConfig, &Step) -> f64);
 
-/// A term of the reward that training adds: its weight times its value in a step.
-struct TrainingTerm(Description, Weight, fn(&Step) -> f64);
-
-/// The setting in `[training]` that holds the weight of a term.
-enum Weight {
-    Constant(fn(&TrainingConfig) -> f64),
-    /// What it is called where it is logged, and its value.
-    Ramp(Description, fn(&TrainingConfig) -> Ramp),
-}
+/// A term of the reward that training adds: its weight times its value in a step. The weight after a number of control steps of the
+/// whole run follows from `[training]`. It is logged under its own description if it changes.
+struct TrainingTerm(
+    Description,
+    Option<Description>,
+    fn(&TrainingConfig, u64) -> f64,
+    fn(&Step) -> f64,
+);
 
 /// Rotation error, rad, below which coming nearer is rewarded hardly more than in proportion.
 const NEAR: f64 = 0.1;
@@ -82,17 +70,18 @@ const TASK: [TaskTerm; 5] = [
 #[rustfmt::skip]
 const TRAINING: [TrainingTerm; 4] = [
     TrainingTerm(Description("progress", "The training reward for turning towards the goal."),
-        Weight::Constant(|training| training.progress_reward),
+        None, |training, _| training.progress_reward,
         |step| step.rot_dist_before - step.rot_dist),
     TrainingTerm(Description("approach", "The training reward for coming nearer to the goal by a factor."),
-        Weight::Constant(|training| training.approach_reward),
+        None, |training, _| training.approach_reward,
         |step| ((step.rot_dist_before + NEAR) / (step.rot_dist + NEAR)).ln()),
     TrainingTerm(Description("within", "The training reward for being within the tolerance."),
-        Weight::Constant(|training| training.hold_reward),
-        |step| f64::from(u8::from(step.within))),
+        None, |training, _| training.hold_reward,
+        |step| f64::from(step.within)),
     TrainingTerm(Description("drop", "The training reward for a drop, which is negative."),
-        Weight::Ramp(Description("drop_reward", "The training reward for the step of a drop."), |training| training.drop_reward),
-        |step| f64::from(u8::from(step.dropped))),
+        Some(Description("drop_reward", "The training reward for the step of a drop.")),
+        |training, steps| training.drop_reward.at(steps),
+        |step| f64::from(step.dropped)),
 ];
 
 /// The task's reward by term, in the order of [`task_terms`].
@@ -133,22 +122,14 @@ pub fn task_reward(env: &EnvConfig, step: &Step) -> TaskReward {
 
 /// The reward that training adds to a step, given the weights of its terms.
 pub fn training_reward(weights: &TrainingReward, step: &Step) -> TrainingReward {
-    let mut values = *weights;
-    values
-        .iter_mut()
-        .zip(&TRAINING)
-        .for_each(|(weight, TrainingTerm(.., value))| *weight *= value(step));
-    values
+    std::array::from_fn(|i| weights[i] * (TRAINING[i].3)(step))
 }
 
 /// The weights of the terms that training adds, after `env_steps` control steps of the whole run.
 pub fn training_weights(training: &TrainingConfig, env_steps: u64) -> TrainingReward {
     TRAINING
         .each_ref()
-        .map(|TrainingTerm(_, weight, _)| match weight {
-            Weight::Constant(weight) => weight(training),
-            Weight::Ramp(_, ramp) => ramp(training).at(env_steps),
-        })
+        .map(|term| (term.2)(training, env_steps))
 }
 
 /// The weights that change in the course of a training run, with their descriptions.
@@ -156,10 +137,7 @@ pub fn ramped(weights: &TrainingReward) -> impl Iterator<Item = (Description, f6
     TRAINING
         .iter()
         .zip(*weights)
-        .filter_map(|(TrainingTerm(_, weight, _), value)| match weight {
-            Weight::Constant(_) => None,
-            Weight::Ramp(setting, _) => Some((*setting, value)),
-        })
+        .filter_map(|(term, value)| Some((term.1?, value)))
 }
 
 #[cfg(test)]

@@ -114,8 +114,10 @@ pub fn measure(column: &str) -> &'static Measure {
 }
 
 fn place(column: &str) -> usize {
-    let place = MEASURES.iter().position(|measure| measure.column == column);
-    place.unwrap_or_else(|| panic!("no measure is called {column}"))
+    MEASURES
+        .iter()
+        .position(|measure| measure.column == column)
+        .unwrap_or_else(|| panic!("no measure is called {column}"))
 }
 
 impl Measure {
@@ -191,11 +193,8 @@ impl Played<'_> {
     fn goals_ci95(&self) -> [f64; 2] {
         let count = self.count();
         let mean = self.mean(|episode| episode.goals.into());
-        let squares = self
-            .episodes
-            .iter()
-            .map(|episode| (f64::from(episode.goals) - mean).powi(2));
-        let variance = squares.sum::<f64>() / (count - 1.0);
+        let errors = self.episodes.iter().map(|e| f64::from(e.goals) - mean);
+        let variance = errors.map(|error| error.powi(2)).sum::<f64>() / (count - 1.0);
         let margin = 1.96 * (variance / count).sqrt();
         [mean - margin, mean + margin].map(|x| if x.is_nan() { x } else { x.max(0.0) })
     }

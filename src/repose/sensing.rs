@@ -1,9 +1,11 @@
 //! What a real sensor would add to an observation: white noise, and an offset that stays the same through an episode.
 
+use std::collections::BTreeMap;
+
 use anyhow::{Result, bail};
 use rand_distr::{Distribution, StandardNormal};
 
-use super::observation::{GOAL_QUAT, Group, Layout, OBJECT_QUAT, RELATIVE_QUAT, TIP_QUAT};
+use super::observation::{GOAL_QUAT, Layout, OBJECT_QUAT, RELATIVE_QUAT, TIP_QUAT};
 use crate::config::ByGroup;
 use crate::os::shortened;
 use crate::quat::{self, Quat};
@@ -11,7 +13,7 @@ use crate::rng::Rng;
 
 /// The standard deviations of what is added to each value of an observation, by index, where they are not 0.
 #[derive(Clone, Debug)]
-pub struct NoiseStd(Vec<(usize, f32)>);
+pub struct NoiseStd(pub Vec<(usize, f32)>);
 
 impl NoiseStd {
     /// Spreads the values of groups over the values of an observation.
@@ -22,8 +24,7 @@ impl NoiseStd {
         let measured: Vec<&str> = layout.measured().map(|group| group.name).collect();
         for name in groups.keys() {
             if !measured.contains(&name.as_str()) {
-                let known = layout.groups.iter().any(|group| group.name == name);
-                let what = if known {
+                let what = if layout.groups.iter().any(|group| group.name == name) {
                     "is not measured"
                 } else {
                     "is not a group of the observation"
@@ -35,28 +36,14 @@ impl NoiseStd {
                 );
             }
         }
-        let of_group = |Group {
-                            name,
-                            start,
-                            length,
-                            ..
-                        }: Group| {
-            let std = groups.get(name).copied().unwrap_or(0.0) as f32;
-            (start..start + length).map(move |i| (i, std))
-        };
-        Ok(Self(
-            layout
-                .groups
-                .into_iter()
-                .flat_map(of_group)
-                .filter(|&(_, std)| std != 0.0)
-                .collect(),
-        ))
-    }
-
-    /// Whether nothing is added to any value.
-    pub fn is_empty(&self) -> bool {
-        self.0.is_empty()
+        let mut all = Vec::new();
+        for group in layout.groups {
+            let std = groups.get(group.name).map_or(0.0, |&std| std as f32);
+            if std != 0.0 {
+                all.extend(group.cells().map(|i| (i, std)));
+            }
+        }
+        Ok(Self(all))
     }
 
     /// Draws what is added: independent normal numbers.
@@ -67,36 +54,22 @@ impl NoiseStd {
     }
 }
 
-/// Adds offsets to others. Both are in the order of the values of an observation.
-pub fn combine(bias: &mut Vec<(usize, f32)>, more: impl Iterator<Item = (usize, f32)>) {
-    for (i, added) in more {
-        match bias.binary_search_by_key(&i, |&(i, _)| i) {
-            Ok(at) => bias[at].1 += added,
-            Err(at) => bias.insert(at, (i, added)),
+/// Adds the offset of an episode, which has these parts by the numbers of the values. On an orientation q it is a small rotation q ⊗ (1, v), where v are the last three of its four
+/// numbers. It stays the same however the body turns.
+pub fn offset(observation: &mut [f32], bias: &BTreeMap<usize, f32>, layout: &Layout) {
+    let orientations = || {
+        let tips = layout.tips().map(|tip| tip + TIP_QUAT);
+        tips.chain([layout.start(OBJECT_QUAT)])
+    };
+    let of_value = |i: usize| bias.get(&i).copied().unwrap_or_default();
+    for (&i, added) in bias {
+        if !orientations().any(|at| (at..at + 4).contains(&i)) {
+            observation[i] += added;
         }
     }
-}
-
-/// Adds the offset of an episode. On an orientation q it is a small rotation q ⊗ (1, v), where v are the last three of its four
-/// numbers. It stays the same however the body turns.
-pub fn offset(observation: &mut [f32], bias: &[(usize, f32)], layout: &Layout) {
-    let orientations = || {
-        std::iter::once(layout.start(OBJECT_QUAT)).chain(layout.tips().map(|tip| tip + TIP_QUAT))
-    };
-    let of_value = |i: usize| {
-        bias.binary_search_by_key(&i, |&(i, _)| i)
-            .map_or(0.0, |at| bias[at].1)
-    };
-    let in_orientation = |i: usize| orientations().any(|at| (at..at + 4).contains(&i));
-    bias.iter()
-        .filter(|(i, _)| !in_orientation(*i))
-        .for_each(|&(i, added)| observation[i] += added);
     for at in orientations() {
-        let q = [0, 1, 2, 3].map(|i| observation[at + i]);
-        let turned = quat::mul(
-            q,
-            [1.0, of_value(at + 1), of_value(at + 2), of_value(at + 3)],
-        );
+        let error = [1.0, of_value(at + 1), of_value(at + 2), of_value(at + 3)];
+        let turned = quat::mul(quat::read(observation, at), error);
         observation[at..at + 4].copy_from_slice(&turned);
     }
 }
@@ -105,20 +78,17 @@ pub fn offset(observation: &mut [f32], bias: &[(usize, f32)], layout: &Layout) {
 /// orientation relative to the goal follows from the orientation of the object.
 pub fn make_consistent(observation: &mut [f32], layout: &Layout) {
     let read = |observation: &[f32], at: usize| {
-        let q = [0, 1, 2, 3].map(|i| f64::from(observation[at + i]));
+        let q = quat::read(observation, at).map(f64::from);
         let length = quat::length(&q);
         // Noise this close to the negative of a quaternion leaves no orientation.
         if length > 1e-6 {
             q.map(|x| x / length)
         } else {
-            [1.0, 0.0, 0.0, 0.0]
+            quat::IDENTITY
         }
     };
     let write = |observation: &mut [f32], at: usize, q: Quat| {
-        observation[at..at + 4]
-            .iter_mut()
-            .zip(q)
-            .for_each(|(cell, x)| *cell = x as f32);
+        observation[at..at + 4].copy_from_slice(&q.map(|x| x as f32));
     };
     let [object_at, goal_at, relative_at] =
         [OBJECT_QUAT, GOAL_QUAT, RELATIVE_QUAT].map(|group| layout.start(group));
@@ -191,7 +161,7 @@ mod tests {
     #[test]
     fn the_offset_of_an_orientation_is_the_same_rotation_however_the_cube_lies() {
         let bias = spread(&[("cube_quat", 0.05), ("joint_pos", 0.1)]).unwrap();
-        let bias: Vec<(usize, f32)> = bias.draw(&mut rng::stream(1, "bias", 0)).collect();
+        let bias: BTreeMap<usize, f32> = bias.draw(&mut rng::stream(1, "bias", 0)).collect();
         let mut turns = rng::stream(2, "turns", 0);
         let mut off = || {
             let q = quat::canonical(quat::uniform(
@@ -201,10 +171,7 @@ mod tests {
             observation[shadow().start(OBJECT_QUAT)..][..4].copy_from_slice(&q.map(|x| x as f32));
             offset(&mut observation, &bias, &shadow());
             make_consistent(&mut observation, &shadow());
-            assert_eq!(
-                observation[5],
-                0.1 + bias.iter().find(|(i, _)| *i == 5).unwrap().1
-            );
+            assert_eq!(observation[5], 0.1 + bias[&5]);
             assert_eq!(observation[30], 0.1);
             let seen =
                 [0, 1, 2, 3].map(|i| f64::from(observation[shadow().start(OBJECT_QUAT) + i]));

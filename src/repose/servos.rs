@@ -32,10 +32,8 @@ impl Servos {
 
     /// Starts with `targets`, as if they had been sent all the time before.
     pub fn reset(&mut self, targets: impl IntoIterator<Item = f64>, delay: usize) {
-        self.targets
-            .iter_mut()
-            .zip(targets)
-            .for_each(|(own, target)| *own = target);
+        self.targets.clear();
+        self.targets.extend(targets);
         self.due.copy_from_slice(&self.targets);
         self.delay = delay;
         self.sent.clear();

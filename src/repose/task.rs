@@ -81,13 +81,9 @@ impl Task {
         let scene = nominal.varied(&Physics::of_task(&config).changes(&hand));
         hand.object.inertia *= config.cube_mass_scale;
         config.goal_position.settle(hand.place());
-        let near = config
-            .goal_position
-            .value
-            .iter()
-            .all(|x| x.abs() <= FARTHEST);
+        let mut place = config.goal_position.value.iter();
         ensure!(
-            near,
+            place.all(|x| x.abs() <= FARTHEST),
             "{}: `{}` starts more than {FARTHEST} m away",
             origin(file),
             hand.parts.object
@@ -95,29 +91,18 @@ impl Task {
         settle_sizes(&mut config, &hand, file)?;
         let noise = NoiseStd::new(&config.noise, &hand.layout).context("env.noise")?;
         let bias = NoiseStd::new(&config.bias, &hand.layout).context("env.bias")?;
-        let symmetry = scene.symmetry(hand.object.body);
-        let task = Self {
+        Ok(Arc::new(Self {
+            predictor: Predictor::new(&scene, &hand, &config)?,
+            symmetry: scene.symmetry(hand.object.body),
             scene,
             compilation,
             hand,
             config,
             noise,
             bias,
-            symmetry,
             mirror: None,
-            predictor: None,
             warnings: Vec::new(),
-        };
-        Ok(Arc::new(task.predicting().with_context(|| origin(file))?))
-    }
-
-    /// The same task, predicting with its own physics, if it predicts.
-    fn predicting(mut self) -> Result<Self> {
-        if self.config.prediction > 0 {
-            let predictor = Predictor::new(&self.scene, &self.hand, &self.config)?;
-            self.predictor = Some(Arc::new(predictor));
-        }
-        Ok(self)
+        }))
     }
 
     /// Loads the same task in a scene for display.
@@ -144,10 +129,9 @@ impl Task {
     /// The same task at the stage of a run in which `other` is: its actions are smoothed as there.
     #[must_use]
     pub fn at_the_stage_of(&self, other: &EnvConfig) -> Arc<Self> {
-        let act_moving_average = other.act_moving_average;
         Arc::new(Self {
             config: EnvConfig {
-                act_moving_average,
+                act_moving_average: other.act_moving_average,
                 ..self.config.clone()
             },
             ..self.clone()
@@ -157,11 +141,11 @@ impl Task {
     /// Notes on the side of the hand and on a user's scene: what the settings replace in it, and whether the goal and the start of its
     /// cube come from it.
     pub fn notes(&self) -> Vec<String> {
-        let mirrored = self
-            .mirror
-            .iter()
-            .map(|_| "the policy is for the hand on the other side: it plays mirrored".to_owned());
-        let mut notes: Vec<String> = mirrored.collect();
+        let mut notes = Vec::new();
+        if self.mirror.is_some() {
+            notes
+                .push("the policy is for the hand on the other side: it plays mirrored".to_owned());
+        }
         let prediction = self.config.prediction;
         if prediction > 0 {
             let delay = self.config.action_delay;
@@ -351,8 +335,8 @@ impl Task {
         let mut compilation = self.compilation.clone();
         compilation.size *= size;
         compilation.shifts |= shifts;
-        let scene = Scene::load(config.model_file(), &compilation)?;
-        Ok(scene.varied(&Physics::of_task(config).changes(&self.hand)))
+        Ok(Scene::load(config.model_file(), &compilation)?
+            .varied(&Physics::of_task(config).changes(&self.hand)))
     }
 }
 

@@ -135,16 +135,17 @@ impl Compilation {
     /// Fails with MuJoCo's own message if MuJoCo refuses the scene, or if a name is not UTF-8 or very long.
     pub(super) fn finish(&self, mut spec: MjSpec) -> Result<MjModel> {
         // MuJoCo compiles on threads, and ends the process if the system refuses one.
-        let thread = thread::Builder::new().spawn(|| ());
-        thread.context("the system refuses a thread")?;
+        thread::Builder::new()
+            .spawn(|| ())
+            .context("the system refuses a thread")?;
         let model = spec
             .compile_with_vfs(&self.files.for_mujoco())
             .map_err(refused)?;
         // The wrapper returns names as text, whatever their bytes are.
         let names: Vec<u8> = model.names().iter().map(|&byte| byte as u8).collect();
-        let is_name = |name: &[u8]| name.len() <= LONGEST_NAME && str::from_utf8(name).is_ok();
+        let mut names = names.split(|&byte| byte == 0);
         ensure!(
-            names.split(|&byte| byte == 0).all(is_name),
+            names.all(|name| name.len() <= LONGEST_NAME && str::from_utf8(name).is_ok()),
             "a name in it is not UTF-8, or has more than {LONGEST_NAME} bytes"
         );
         Ok(model)
@@ -159,9 +160,10 @@ impl Compilation {
             None => MjSpec::from_xml_string(BUILTIN),
             Some(file) => MjSpec::from_xml_vfs(file, &self.files.for_mujoco()),
         };
-        let whole = || file.and_then(parse_error);
-        let mut spec =
-            spec.map_err(|error| refused(whole().unwrap_or_else(|| error.to_string())))?;
+        let mut spec = spec.map_err(|error| {
+            let whole = file.and_then(parse_error);
+            refused(whole.unwrap_or_else(|| error.to_string()))
+        })?;
         if self.keeps_all() {
             return Ok(spec);
         }
@@ -239,13 +241,13 @@ fn add_goal(spec: &mut MjSpec, compiled: &MjModel, name: &str, goal: &str) -> Re
     let object = compiled
         .name_to_id(mjOBJ_BODY, name)
         .context("a body of the compiled scene")?;
-    let frames = frames_within(compiled, object);
-    let shown = spec.world_body_mut().add_body();
-    shown
+    let shown = spec
+        .world_body_mut()
+        .add_body()
         .with_name(goal)
         .with_pos(compiled.body_pos()[object])
         .with_mocap(true);
-    for (geom, (mut pos, mut quat)) in geoms_within(compiled, &frames) {
+    for (geom, (mut pos, mut quat)) in geoms_within(compiled, &frames_within(compiled, object)) {
         let kind = compiled.geom_type()[geom];
         let mut mesh_name = "";
         if matches!(kind, mjGEOM_MESH | mjGEOM_SDF) {
@@ -256,11 +258,13 @@ fn add_goal(spec: &mut MjSpec, compiled: &MjModel, name: &str, goal: &str) -> Re
             let moved = quat::rotate(quat, compiled.mesh_pos()[mesh]);
             pos = [0, 1, 2].map(|axis| pos[axis] - moved[axis]);
         }
-        let copy = only_seen(shown)
+        only_seen(shown)
             .with_type(kind)
-            .with_size(compiled.geom_size()[geom]);
-        copy.with_pos(pos).with_quat(quat).with_meshname(mesh_name);
-        copy.with_group(compiled.geom_group()[geom])
+            .with_size(compiled.geom_size()[geom])
+            .with_pos(pos)
+            .with_quat(quat)
+            .with_meshname(mesh_name)
+            .with_group(compiled.geom_group()[geom])
             .with_rgba([0.2, 0.8, 0.2, 0.4]);
     }
     Ok(())

@@ -36,33 +36,31 @@ impl Scene {
     pub fn drawing(&self, dressed: Option<&str>, from: Option<Camera>) -> Drawing {
         let model = &*self.model;
         let dressed = dressed.filter(|_| model.ffi().nmesh > 0);
-        let floor = (0..model.ngeom() as usize).find(|&geom| is_floor(model, geom));
+        let floor = ids(model.ngeom()).find(|&geom| is_floor(model, geom));
         let (geoms, meshes) = drawn_geoms(model, dressed, floor);
         let floor = floor.map(|geom| model.geom_pos()[geom][2]);
-        let bodies: Value = (0..model.nbody() as usize)
+        let bodies: Value = ids(model.nbody())
             .map(|body| drawn_body(model, body))
             .collect();
         let scene = json!({ "bodies": bodies, "geoms": geoms, "floor": floor, "camera": camera(model, from) });
         let positions = model.nq() as usize;
         let mut start = model.qpos0().to_vec();
-        for body in (0..model.nbody() as usize).filter(|&body| model.body_mocapid()[body] >= 0) {
+        for body in ids(model.nbody()).filter(|&body| model.body_mocapid()[body] >= 0) {
             start.extend(model.body_pos()[body]);
             start.extend(model.body_quat()[body]);
         }
-        let of_joints =
-            (0..model.njnt() as usize).filter_map(|joint| match model.jnt_type()[joint] {
-                mjJNT_FREE => Some(model.jnt_qposadr()[joint] as usize + 3),
-                mjJNT_BALL => Some(model.jnt_qposadr()[joint] as usize),
-                _ => None,
-            });
-        let quaternions = of_joints
-            .chain((positions + 3..start.len()).step_by(7))
-            .collect();
+        let of_joints = ids(model.njnt()).filter_map(|joint| match model.jnt_type()[joint] {
+            mjJNT_FREE => Some(model.jnt_qposadr()[joint] as usize + 3),
+            mjJNT_BALL => Some(model.jnt_qposadr()[joint] as usize),
+            _ => None,
+        });
         Drawing {
+            quaternions: of_joints
+                .chain((positions + 3..start.len()).step_by(7))
+                .collect(),
             scene,
             start,
             positions,
-            quaternions,
             meshes,
         }
     }
@@ -77,7 +75,7 @@ fn drawn_geoms(
     let mut geoms = Vec::new();
     let mut meshes = Vec::new();
     let mut parts = BTreeMap::new();
-    for geom in (0..model.ngeom() as usize).filter(|geom| Some(*geom) != floor) {
+    for geom in ids(model.ngeom()).filter(|geom| Some(*geom) != floor) {
         let Some(drawn) = drawn_geom(model, geom, dressed) else {
             continue;
         };
@@ -199,9 +197,7 @@ fn drawn_mesh(model: &MjModel, mesh: usize) -> Vec<Mesh> {
             parts.push(Mesh::default());
             places.clear();
         }
-        let Some((corners, triangles)) = parts.last_mut() else {
-            continue;
-        };
+        let (corners, triangles) = parts.last_mut().expect("there is a first part");
         triangles.push([0, 1, 2].map(|corner| {
             let point = model.mesh_vert()[(points + face[corner]) as usize];
             let normal = model.mesh_normal()[(normals + directions[corner]) as usize];

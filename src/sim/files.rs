@@ -26,14 +26,16 @@ impl SceneFiles {
     /// Fails as [`scene_files`] does.
     pub fn read(scene: &Path) -> Result<Self> {
         let read = |path: PathBuf| Some((path.to_str()?.to_owned(), read_bytes(&path).ok()?));
-        let files = scene_files(scene)?.into_iter().filter_map(read);
-        Ok(Self(files.collect()))
+        Ok(Self(
+            scene_files(scene)?.into_iter().filter_map(read).collect(),
+        ))
     }
 
     /// Whether they are the files of this scene.
     pub fn hold(&self, scene: &Path) -> bool {
-        let first = self.0.first();
-        first.is_some_and(|(name, _)| Path::new(name) == scene)
+        self.0
+            .first()
+            .is_some_and(|(name, _)| Path::new(name) == scene)
     }
 
     /// The files for MuJoCo, which reads from the disk what is not among them.
@@ -73,9 +75,11 @@ pub fn scene_files(scene: &Path) -> Result<Vec<PathBuf>> {
             } else if name.starts_with(b"file") {
                 named.push((near.clone(), value));
                 if [&b"include"[..], b"model"].contains(&&*element) {
-                    let is_new =
-                        |path: &PathBuf| path.canonicalize().is_ok_and(|end| known.insert(end));
-                    scenes.extend(places.into_iter().filter(is_new));
+                    scenes.extend(
+                        places
+                            .into_iter()
+                            .filter(|path| path.canonicalize().is_ok_and(|end| known.insert(end))),
+                    );
                 }
             }
         }

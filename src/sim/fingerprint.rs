@@ -71,7 +71,7 @@ impl Scene {
 
 /// Takes the shapes that can touch something.
 fn take_geoms(model: &MjModel, take: &mut dyn FnMut(&[&dyn Debug])) {
-    for geom in 0..model.ngeom() as usize {
+    for geom in ids(model.ngeom()) {
         if !touches(model, geom) {
             continue;
         }

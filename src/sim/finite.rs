@@ -51,28 +51,20 @@ fn first_in_assets(model: &MjModel) -> Option<String> {
     };
     let height = model.hfield_data().iter().position(|x| !x.is_finite());
     let height = height.map(|at| {
-        (
-            "hfield_data",
-            "hfield",
-            mjOBJ_HFIELD,
-            of(model.hfield_adr(), at),
-        )
+        let field = of(model.hfield_adr(), at);
+        ("hfield_data of hfield", mjOBJ_HFIELD, field)
     });
     let vertex = model
         .mesh_vert()
         .iter()
         .position(|vertex| !vertex.iter().all(|x| x.is_finite()));
     let vertex = vertex.map(|at| {
-        (
-            "mesh_vert",
-            "mesh",
-            mjOBJ_MESH,
-            of(model.mesh_vertadr(), at),
-        )
+        let mesh = of(model.mesh_vertadr(), at);
+        ("mesh_vert of mesh", mjOBJ_MESH, mesh)
     });
-    let (quantity, kind, object, id) = height.or(vertex)?;
-    let name = model.id_to_name(object, id).unwrap_or_default();
-    Some(format!("{quantity} of {kind} `{}`", shortened(name)))
+    let (what, kind, id) = height.or(vertex)?;
+    let name = model.id_to_name(kind, id).unwrap_or_default();
+    Some(format!("{what} `{}`", shortened(name)))
 }
 
 /// Quantities that MuJoCo computes when it compiles a model, in addition to the names that end with 0.

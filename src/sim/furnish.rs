@@ -11,6 +11,7 @@ use mujoco_rs::wrappers::mj_editing::MjsBody;
 
 use super::compilation::{Compilation, VISUAL, only_seen};
 use super::constants::*;
+use crate::quat;
 
 /// The colours of the faces, as in the built-in scene: +x, -x, +y, -y, +z, -z.
 const FACES: [[f32; 3]; 6] = [
@@ -51,20 +52,20 @@ pub fn furnished(
     }
     let mut spec = compilation.spec(Some(file))?;
     if is_dark {
-        let light = spec.world_body_mut().add_light();
-        light
+        spec.world_body_mut()
+            .add_light()
             .with_pos([0.0, 0.0, 2.0])
             .with_dir([0.2, 0.4, -1.0])
             .with_type(mjLIGHT_DIRECTIONAL);
     }
     if has_no_sky {
-        let sky = spec.add_texture();
-        sky.with_name("sky of shadow-repose")
-            .with_type(mjTEXTURE_SKYBOX);
-        sky.with_builtin(mjBUILTIN_GRADIENT)
+        spec.add_texture()
+            .with_name("sky of shadow-repose")
+            .with_type(mjTEXTURE_SKYBOX)
+            .with_builtin(mjBUILTIN_GRADIENT)
             .with_width(64)
-            .with_height(384);
-        sky.with_rgb1([0.74, 0.78, 0.83])
+            .with_height(384)
+            .with_rgb1([0.74, 0.78, 0.83])
             .with_rgb2([0.42, 0.49, 0.58]);
     }
     for (name, half, opacity) in boxes {
@@ -88,13 +89,12 @@ fn colour_faces(body: &mut MjsBody, half: [f64; 3], opacity: f32) {
         } else {
             -half[axis]
         };
-        let plate = only_seen(body)
+        only_seen(body)
             .with_type(mjGEOM_BOX)
             .with_size(size)
-            .with_pos(position);
-        // Regardless of the defaults of its class.
-        plate.with_quat([1.0, 0.0, 0.0, 0.0]);
-        plate
+            .with_pos(position)
+            // Regardless of the defaults of its class.
+            .with_quat(quat::IDENTITY)
             .with_rgba([red, green, blue, opacity])
             .with_group(VISUAL);
     }
@@ -107,6 +107,6 @@ fn plain_box(model: &MjModel, body: usize) -> Option<[f64; 3]> {
         && model.geom_type()[geom] == mjGEOM_BOX
         && model.geom_matid()[geom] < 0
         && model.geom_pos()[geom] == [0.0; 3]
-        && model.geom_quat()[geom] == [1.0, 0.0, 0.0, 0.0];
+        && model.geom_quat()[geom] == quat::IDENTITY;
     is_plain.then(|| model.geom_size()[geom])
 }

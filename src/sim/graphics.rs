@@ -1,6 +1,7 @@
 //! Error handling shared by the window and the renderer, whose underlying libraries fail in their own ways.
 
 use std::error::Error;
+use std::panic;
 
 use anyhow::{Chain, Result, anyhow};
 
@@ -9,10 +10,10 @@ use crate::schedule::caught;
 /// Runs `f` and turns a panic into an error without printing it: the windowing libraries panic e.g. if a shared library is
 /// missing.
 pub fn attempt<T, E: Error + 'static>(f: impl FnOnce() -> Result<T, E>) -> Result<T> {
-    let hook = std::panic::take_hook();
-    std::panic::set_hook(Box::new(|_| {}));
+    let hook = panic::take_hook();
+    panic::set_hook(Box::new(|_| {}));
     let result = caught(f);
-    std::panic::set_hook(hook);
+    panic::set_hook(hook);
     result
         .map_err(anyhow::Error::msg)?
         .map_err(|error| described(&error))

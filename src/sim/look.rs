@@ -121,19 +121,20 @@ impl Dress {
             height,
         } in &self.pieces
         {
-            let found = spec.body_mut(body);
-            let body =
-                found.with_context(|| format!("there is no body {body} for the mesh {file}"))?;
-            let geom = only_seen(body)
+            let body = spec
+                .body_mut(body)
+                .with_context(|| format!("there is no body {body} for the mesh {file}"))?;
+            only_seen(body)
                 .with_type(mjGEOM_MESH)
                 .with_meshname(file)
-                .with_material(material);
-            geom.with_pos([0.0, 0.0, *height]).with_group(VISUAL);
+                .with_material(material)
+                .with_pos([0.0, 0.0, *height])
+                .with_group(VISUAL);
         }
         let mut model = spec
             .compile_with_vfs(&files)
             .map_err(|error| anyhow!("the meshes of the hand: {error}"))?;
-        for geom in 0..model.ngeom() as usize {
+        for geom in ids(model.ngeom()) {
             if is_of(&model, geom, &self.bodies) && model.geom_group()[geom] != VISUAL {
                 model.geom_group_mut()[geom] = HIDDEN;
             }

@@ -48,7 +48,7 @@ pub struct Readout {
 }
 
 /// The user's input.
-#[derive(Clone, Copy)]
+#[derive(Clone, Copy, Default)]
 pub struct Controls {
     /// Whether time is stopped except for single steps.
     pub paused: bool,
@@ -203,13 +203,7 @@ fn draw_gauge(ui: &mut Ui, gauge: &Gauge) {
     } else {
         rect.left()
     };
-    let end = zero
-        + fraction
-            * if gauge.signed {
-                rect.width() / 2.0
-            } else {
-                rect.width()
-            };
+    let end = zero + fraction * (rect.right() - zero);
     let painter = ui.painter();
     painter.rect_filled(rect, 2.0, ui.visuals().extreme_bg_color);
     let bar = Rect::from_min_max(
@@ -224,14 +218,12 @@ fn draw_gauge(ui: &mut Ui, gauge: &Gauge) {
             ui.visuals().widgets.noninteractive.fg_stroke,
         );
     }
-    let colour = ui.visuals().strong_text_color();
-    let at = rect.right_center() - vec2(4.0, 0.0);
     painter.text(
-        at,
+        rect.right_center() - vec2(4.0, 0.0),
         Align2::RIGHT_CENTER,
         &gauge.text,
         FontId::monospace(12.0),
-        colour,
+        ui.visuals().strong_text_color(),
     );
 }
 
@@ -255,10 +247,9 @@ impl egui::Plugin for CloseLeftPanel {
         };
         let edge = pos2(panel.outer_rect.right(), panel.outer_rect.center().y);
         let side = pos2(panel.outer_rect.left() - 50.0, edge.y);
-        let button = egui::PointerButton::Primary;
         let press = |pos, pressed| Event::PointerButton {
             pos,
-            button,
+            button: egui::PointerButton::Primary,
             pressed,
             modifiers: egui::Modifiers::NONE,
         };

@@ -2,6 +2,7 @@
 
 use mujoco_rs::prelude::MjModel;
 
+use super::constants::ids;
 use crate::quat::{self, Quat};
 
 /// A position in m, and an orientation.
@@ -10,7 +11,7 @@ pub type Placed = ([f64; 3], Quat);
 /// The poses in the frame of the body `top`: of itself and of the bodies that it carries, where no joint has moved.
 pub fn frames_within(model: &MjModel, top: usize) -> Vec<Option<Placed>> {
     let mut frames = vec![None; model.nbody() as usize];
-    frames[top] = Some(([0.0; 3], [1.0, 0.0, 0.0, 0.0]));
+    frames[top] = Some(([0.0; 3], quat::IDENTITY));
     // Every body has a higher number than its parent.
     for body in top + 1..frames.len() {
         let parent = frames[model.body_parentid()[body] as usize];
@@ -22,14 +23,13 @@ pub fn frames_within(model: &MjModel, top: usize) -> Vec<Option<Placed>> {
 
 /// The geoms of the bodies that have a pose, each with its own in the same frame.
 pub fn geoms_within(model: &MjModel, frames: &[Option<Placed>]) -> Vec<(usize, Placed)> {
-    let placed = |geom: usize| {
-        let frame = frames[model.geom_bodyid()[geom] as usize]?;
-        Some((
-            geom,
-            inside(frame, model.geom_pos()[geom], model.geom_quat()[geom]),
-        ))
-    };
-    (0..model.ngeom() as usize).filter_map(placed).collect()
+    ids(model.ngeom())
+        .filter_map(|geom| {
+            let frame = frames[model.geom_bodyid()[geom] as usize]?;
+            let place = inside(frame, model.geom_pos()[geom], model.geom_quat()[geom]);
+            Some((geom, place))
+        })
+        .collect()
 }
 
 /// A pose that is given in a frame as a pose in the surroundings of that frame.
@@ -43,11 +43,9 @@ pub fn inside((origin, axes): Placed, position: [f64; 3], orientation: Quat) -> 
 
 /// Whether a geom can be in a contact.
 pub fn touches(model: &MjModel, geom: usize) -> bool {
-    let pairs = [model.pair_geom1(), model.pair_geom2()];
+    let id = geom as i32;
     model.geom_contype()[geom] != 0
         || model.geom_conaffinity()[geom] != 0
-        || pairs
-            .into_iter()
-            .flatten()
-            .any(|&of_pair| of_pair == geom as i32)
+        || model.pair_geom1().contains(&id)
+        || model.pair_geom2().contains(&id)
 }

@@ -36,9 +36,8 @@ impl Renderer {
                 .camera(MjvCamera::new_free(&scene.model))
                 .build(&scene.model)
         };
-        let renderer = attempt(build).map_err(|reason| anyhow!("cannot draw: {reason}{HELP}"))?;
         Ok(Self {
-            renderer,
+            renderer: attempt(build).map_err(|reason| anyhow!("cannot draw: {reason}{HELP}"))?,
             data: MjData::new(scene.model.clone()),
         })
     }

@@ -88,7 +88,7 @@ impl Scene {
     /// # Errors
     /// Fails with the file's name and MuJoCo's own message if MuJoCo refuses the scene.
     pub fn load(file: Option<&Path>, compilation: &Compilation) -> Result<Self> {
-        let compiled = compilation.compile(file).and_then(|model| {
+        let checked = |model| {
             // The built-in scene is known to be finite.
             if file.is_some()
                 && let Some(culprit) = not_finite(&model)?
@@ -96,8 +96,11 @@ impl Scene {
                 bail!("{culprit} is not a finite number");
             }
             Self::checked(model, compilation)
-        });
-        compiled.with_context(|| origin(file))
+        };
+        compilation
+            .compile(file)
+            .and_then(checked)
+            .with_context(|| origin(file))
     }
 
     /// Loads the same scene, with the same physics, and with what is needed for display.
@@ -143,9 +146,8 @@ impl Scene {
             Cone::Pyramidal => model.opt_mut().cone = mjCONE_PYRAMIDAL as i32,
             Cone::Elliptic => model.opt_mut().cone = mjCONE_ELLIPTIC as i32,
         }
-        let halves = model.opt().integrator != mjINT_RK4 as i32;
         ensure!(
-            halves,
+            model.opt().integrator != mjINT_RK4 as i32,
             "the RK4 integrator cannot be stepped in halves; use implicitfast"
         );
         for (flag, bit) in NEEDED {
@@ -154,9 +156,8 @@ impl Scene {
                 "{flag} must not be disabled in its <flag>"
             );
         }
-        let awake = model.opt().enableflags & mjENBL_SLEEP as i32 == 0;
         ensure!(
-            awake,
+            model.opt().enableflags & mjENBL_SLEEP as i32 == 0,
             "sleep is not part of the state that MuJoCo can save; leave sleep switched off"
         );
         Ok(Self {
@@ -205,20 +206,15 @@ impl Scene {
     /// Fails if there is no such body or its first joint is not a free joint.
     pub fn free_body(&self, name: &str) -> Result<FreeJoint> {
         let body = self.body(name)?;
-        let joint = self.free_joint(body.0);
-        let joint =
-            joint.with_context(|| format!("body `{}` must have a free joint", shortened(name)))?;
-        let [qpos, dof] = [
-            self.model.jnt_qposadr()[joint],
-            self.model.jnt_dofadr()[joint],
-        ]
-        .map(|at| at as usize);
-        let inertia = self.model.dof_m0()[dof + 3..dof + 6].iter().sum::<f64>() / 3.0;
+        let joint = self
+            .free_joint(body.0)
+            .with_context(|| format!("body `{}` must have a free joint", shortened(name)))?;
+        let dof = self.model.jnt_dofadr()[joint] as usize;
         Ok(FreeJoint {
             body,
-            qpos,
+            qpos: self.model.jnt_qposadr()[joint] as usize,
             dof,
-            inertia,
+            inertia: self.model.dof_m0()[dof + 3..dof + 6].iter().sum::<f64>() / 3.0,
         })
     }
 
@@ -230,13 +226,14 @@ impl Scene {
 
     /// The names of its keyframes.
     pub fn keyframes(&self) -> Vec<String> {
-        let name = |id| {
-            self.model
-                .id_to_name(mjOBJ_KEY, id)
-                .unwrap_or_default()
-                .to_owned()
-        };
-        (0..self.model.nkey() as usize).map(name).collect()
+        ids(self.model.nkey())
+            .map(|id| {
+                self.model
+                    .id_to_name(mjOBJ_KEY, id)
+                    .unwrap_or_default()
+                    .to_owned()
+            })
+            .collect()
     }
 
     /// Finds the body `name`.
@@ -312,23 +309,33 @@ impl Scene {
         let model = &self.model;
         let group = model.actuator_group()[id];
         let is_disabled = (0..31).contains(&group) && model.opt().disableactuator >> group & 1 == 1;
-        let moves = matches!(model.actuator_trntype()[id], mjTRN_JOINT | mjTRN_TENDON);
-        let is_angle = model.actuator_gear()[id][0] == 1.0;
         let is_direct =
             model.actuator_dyntype()[id] == mjDYN_NONE && model.actuator_delay()[id] == 0.0;
         let ctrl = model.actuator_ctrladr()[id] as usize;
         let is_limited = model.actuator_ctrlnum()[id] == 1 && model.actuator_ctrllimited()[ctrl];
+        // The force is kp · (control - length), with or without damping.
+        let kp = model.actuator_gainprm()[id][0];
+        let is_servo = model.actuator_gaintype()[id] == mjGAIN_FIXED
+            && model.actuator_biastype()[id] == mjBIAS_AFFINE
+            && kp > 0.0
+            && model.actuator_biasprm()[id][..2] == [0.0, -kp];
         for (holds, what) in [
             (
-                self.is_position_servo(id),
+                is_servo,
                 "be a position servo (<position>): its control is an angle",
             ),
             (
                 !is_disabled,
                 &format!("not be disabled by its group {group}"),
             ),
-            (moves, "drive a joint or a tendon"),
-            (is_angle, "have a gear of 1: its control is an angle"),
+            (
+                matches!(model.actuator_trntype()[id], mjTRN_JOINT | mjTRN_TENDON),
+                "drive a joint or a tendon",
+            ),
+            (
+                model.actuator_gear()[id][0] == 1.0,
+                "have a gear of 1: its control is an angle",
+            ),
             (
                 is_direct,
                 "act at once: without activation dynamics (timeconst) and delay",
@@ -348,14 +355,5 @@ impl Scene {
         self.model
             .name_to_id(kind, name)
             .with_context(|| format!("has no {what} `{}`", shortened(name)))
-    }
-
-    /// Whether the force is kp · (control - length), with or without damping.
-    fn is_position_servo(&self, id: usize) -> bool {
-        let kp = self.model.actuator_gainprm()[id][0];
-        self.model.actuator_gaintype()[id] == mjGAIN_FIXED
-            && self.model.actuator_biastype()[id] == mjBIAS_AFFINE
-            && kp > 0.0
-            && self.model.actuator_biasprm()[id][..2] == [0.0, -kp]
     }
 }

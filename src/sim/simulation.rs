@@ -77,13 +77,14 @@ impl Simulation {
     /// Whether the state diverged. MuJoCo resets it silently within the step. Only its warning counters show it.
     fn diverged(&self) -> bool {
         let warnings = self.data.warning();
-        let kinds = [
+        [
             mjWARN_BADQPOS,
             mjWARN_BADQVEL,
             mjWARN_BADQACC,
             mjWARN_BADCTRL,
-        ];
-        kinds.iter().any(|&kind| warnings[kind as usize].number > 0)
+        ]
+        .iter()
+        .any(|&kind| warnings[kind as usize].number > 0)
     }
 
     /// The generalised positions, in the model's order: rad, m, and quaternions.
@@ -110,19 +111,19 @@ impl Simulation {
     /// constraints hold then. [`Simulation::refresh`] must follow.
     pub fn follow(&mut self) -> bool {
         let model = self.data.model().clone();
-        let is_tie = |&i: &usize| model.eq_type()[i] == mjEQ_JOINT && model.eq_active0()[i];
-        let ties: Vec<usize> = (0..model.neq() as usize).filter(is_tie).collect();
-        let from_reference = |qpos: &[f64], joint: i32| {
-            let place = *model.jnt_qposadr().get(joint as usize)? as usize;
-            Some(qpos[place] - model.qpos0()[place])
-        };
+        let ties: Vec<_> = ids(model.neq())
+            .filter(|&i| model.eq_type()[i] == mjEQ_JOINT && model.eq_active0()[i])
+            .collect();
         // A joint may follow one that follows.
         (0..=ties.len()).any(|_| {
             let mut apart: f64 = 0.0;
             for &tie in &ties {
                 let qpos = self.qpos_mut();
                 // Without a second joint, the first is held where it is.
-                let other = from_reference(qpos, model.eq_obj2id()[tie]).unwrap_or(0.0);
+                let other = model
+                    .jnt_qposadr()
+                    .get(model.eq_obj2id()[tie] as usize)
+                    .map_or(0.0, |&at| qpos[at as usize] - model.qpos0()[at as usize]);
                 let wanted = model.eq_data()[tie][..5]
                     .iter()
                     .rfold(0.0, |sum, factor| sum * other + factor);
@@ -184,10 +185,9 @@ impl Simulation {
             Frame::Site(id) => {
                 let model = self.data.model();
                 let body = self.data.xquat()[model.site_bodyid()[id] as usize];
-                let orientation = quat::mul(body, model.site_quat()[id]);
                 Pose {
                     position: self.data.site_xpos()[id],
-                    orientation,
+                    orientation: quat::mul(body, model.site_quat()[id]),
                 }
             }
         }
@@ -224,10 +224,9 @@ impl Simulation {
             .first_chunk::<6>()
             .expect("a free joint");
         // MuJoCo stores the angular velocity of a free joint in the body's frame.
-        let angular = quat::rotate(self.free_pose(joint).orientation, spin);
         Velocity {
             linear: [x, y, z],
-            angular,
+            angular: quat::rotate(self.free_pose(joint).orientation, spin),
         }
     }
 

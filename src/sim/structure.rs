@@ -43,8 +43,7 @@ impl Scene {
     ///
     /// # Errors
     /// Fails with one message on all that is missing or ambiguous, and the settings that mend it.
-    pub fn find_parts(&self, named: &Parts) -> Result<Parts> {
-        let mut parts = named.clone();
+    pub fn find_parts(&self, mut parts: Parts) -> Result<Parts> {
         let mut problems = Problems::new();
         let hand = self.find_hand(&mut parts, &mut problems);
         let others =
@@ -67,8 +66,9 @@ impl Scene {
             .flatten()
             .map(|body| self.root_of(body))
             .collect();
-        let is_goal = |body: &usize| self.model.body_mocapid()[*body] >= 0 && !held.contains(body);
-        let goals: Vec<usize> = others.filter(is_goal).collect();
+        let goals: Vec<usize> = others
+            .filter(|body| self.model.body_mocapid()[*body] >= 0 && !held.contains(body))
+            .collect();
         self.name_only(
             &goals,
             &mut parts.goal,
@@ -82,8 +82,7 @@ impl Scene {
     /// Names the parts of the hand that are not named. The result is the first bodies of the trees that its actuators move.
     fn find_hand(&self, parts: &mut Parts, problems: &mut Problems) -> BTreeSet<usize> {
         if parts.actuators.is_empty() {
-            parts.actuators =
-                self.names(mjOBJ_ACTUATOR, 0..self.model.nactuator() as usize, problems);
+            parts.actuators = self.names(mjOBJ_ACTUATOR, ids(self.model.nactuator()), problems);
         }
         let actuators = parts
             .actuators
@@ -101,12 +100,13 @@ impl Scene {
             .map(|body| self.root_of(body as usize))
             .filter(|tree| *tree > 0)
             .collect();
-        let is_hinge = |&joint: &usize| {
-            trees.contains(&self.root_of(self.model.jnt_bodyid()[joint] as usize))
-                && self.model.jnt_type()[joint] == mjJNT_HINGE
-                && self.model.jnt_limited()[joint]
-        };
-        let hinges: Vec<usize> = (0..self.model.njnt() as usize).filter(is_hinge).collect();
+        let hinges: Vec<usize> = ids(self.model.njnt())
+            .filter(|&joint| {
+                trees.contains(&self.root_of(self.model.jnt_bodyid()[joint] as usize))
+                    && self.model.jnt_type()[joint] == mjJNT_HINGE
+                    && self.model.jnt_limited()[joint]
+            })
+            .collect();
         if parts.joints.is_empty() {
             parts.joints = self.names(mjOBJ_JOINT, hinges.iter().copied(), problems);
         }
@@ -140,8 +140,8 @@ impl Scene {
             *part = self.names(mjOBJ_BODY, [only], problems).concat();
             return;
         }
-        let names = self.names(mjOBJ_BODY, found.iter().copied(), &mut Problems::new());
-        let names: Vec<String> = names
+        let names: Vec<_> = self
+            .names(mjOBJ_BODY, found.iter().copied(), &mut Problems::new())
             .iter()
             .map(|name| format!("`{}`", shortened(name)))
             .collect();
@@ -167,8 +167,9 @@ impl Scene {
                 _ => None,
             }
         };
-        let is_active = |&i: &usize| model.eq_active0()[i];
-        (0..model.neq() as usize).filter(is_active).filter_map(ends)
+        ids(model.neq())
+            .filter(|&i| model.eq_active0()[i])
+            .filter_map(ends)
     }
 
     /// Whether a joint is part of a loop that such a constraint closes: it moves one end without the other.
@@ -201,37 +202,29 @@ impl Scene {
     /// The joints that an actuator drives, with the coefficients of their sum, which is its length. A tendon along a path
     /// in space drives no sum.
     pub fn driven(&self, actuator: Actuator) -> Vec<(String, f64)> {
-        let name = |joint: usize| {
-            self.model
-                .id_to_name(mjOBJ_JOINT, joint)
-                .unwrap_or_default()
-                .to_owned()
-        };
-        let joints = self
-            .wraps(actuator.id)
-            .into_iter()
-            .filter(|(kind, ..)| *kind == mjWRAP_JOINT);
-        joints
-            .map(|(_, joint, coefficient)| (name(joint), coefficient))
-            .collect()
+        let mut driven = Vec::new();
+        for (kind, id, coefficient) in self.wraps(actuator.id) {
+            if kind == mjWRAP_JOINT {
+                let name = self.model.id_to_name(mjOBJ_JOINT, id).unwrap_or_default();
+                driven.push((name.to_owned(), coefficient));
+            }
+        }
+        driven
     }
 
     /// What an actuator or its tendon acts on: the kind, the number, and the coefficient if it is a joint.
     fn wraps(&self, actuator: usize) -> Vec<(MjtWrap, usize, f64)> {
         let target = self.model.actuator_trnid()[actuator][0] as usize;
-        let wrap = |at: usize| {
-            (
-                self.model.wrap_type()[at],
-                self.model.wrap_objid()[at] as usize,
-                self.model.wrap_prm()[at],
-            )
-        };
-        match self.model.actuator_trntype()[actuator] {
+        let model = &self.model;
+        match model.actuator_trntype()[actuator] {
             mjTRN_JOINT => vec![(mjWRAP_JOINT, target, 1.0)],
             mjTRN_TENDON => {
-                let first = self.model.tendon_adr()[target] as usize;
-                (first..first + self.model.tendon_num()[target] as usize)
-                    .map(wrap)
+                let first = model.tendon_adr()[target] as usize;
+                (first..first + model.tendon_num()[target] as usize)
+                    .map(|at| {
+                        let id = model.wrap_objid()[at] as usize;
+                        (model.wrap_type()[at], id, model.wrap_prm()[at])
+                    })
                     .collect()
             }
             _ => Vec::new(),
@@ -262,11 +255,7 @@ impl Scene {
 
     /// The names of all joints that have one.
     pub fn joints(&self) -> Vec<String> {
-        self.names(
-            mjOBJ_JOINT,
-            0..self.model.njnt() as usize,
-            &mut Problems::new(),
-        )
+        self.names(mjOBJ_JOINT, ids(self.model.njnt()), &mut Problems::new())
     }
 
     /// The joints besides these hinges and the joint of this object, by name or number.
@@ -276,8 +265,8 @@ impl Scene {
             .map(|hinge| hinge.qpos)
             .chain([object.qpos])
             .collect();
-        let unknown = |joint: &usize| !known.contains(&(self.model.jnt_qposadr()[*joint] as usize));
-        let joints = (0..self.model.njnt() as usize).filter(unknown);
+        let joints = ids(self.model.njnt())
+            .filter(|&joint| !known.contains(&(self.model.jnt_qposadr()[joint] as usize)));
         let name = |joint| match self.model.id_to_name(mjOBJ_JOINT, joint) {
             Some(name) => format!("joint `{name}`"),
             None => format!("joint {joint}"),
@@ -289,7 +278,7 @@ impl Scene {
     pub fn actuators(&self) -> Vec<String> {
         self.names(
             mjOBJ_ACTUATOR,
-            0..self.model.nactuator() as usize,
+            ids(self.model.nactuator()),
             &mut Problems::new(),
         )
     }

@@ -32,13 +32,9 @@ impl Scene {
     /// With moving parts there is only the identity.
     pub fn symmetry(&self, body: Body) -> Vec<usize> {
         let form = self.form(body);
-        let turns = CUBE_ROTATIONS
-            .iter()
-            .map(|turn| quat::normalized(turn.map(f64::from)));
-        turns
-            .enumerate()
-            .filter(|&(i, turn)| i == 0 || form.holds(turn))
-            .map(|(i, _)| i)
+        let turn = |i: usize| quat::normalized(CUBE_ROTATIONS[i].map(f64::from));
+        (0..CUBE_ROTATIONS.len())
+            .filter(|&i| i == 0 || form.holds(turn(i)))
             .collect()
     }
 
@@ -46,16 +42,15 @@ impl Scene {
     pub fn round_axes(&self, body: Body) -> String {
         let form = self.form(body);
         let (sin, cos) = 0.5_f64.sin_cos();
-        let turns = [
+        [
             ('x', [cos, sin, 0.0, 0.0]),
             ('y', [cos, 0.0, sin, 0.0]),
             ('z', [cos, 0.0, 0.0, sin]),
-        ];
-        turns
-            .into_iter()
-            .filter(|&(_, turn)| form.holds(turn))
-            .map(|(axis, _)| axis)
-            .collect()
+        ]
+        .into_iter()
+        .filter(|&(_, turn)| form.holds(turn))
+        .map(|(axis, _)| axis)
+        .collect()
     }
 
     fn form(&self, Body(top): Body) -> Form {
@@ -82,14 +77,14 @@ impl Scene {
                 }
             }
         }
-        let touching = geoms_within(model, &frames)
+        let shapes = geoms_within(model, &frames)
             .into_iter()
-            .filter(|&(geom, _)| touches(model, geom));
-        let shapes = touching.map(|(geom, place)| Shape {
-            kind: (model.geom_type()[geom], model.geom_dataid()[geom]),
-            size: model.geom_size()[geom],
-            place,
-        });
+            .filter(|&(geom, _)| touches(model, geom))
+            .map(|(geom, place)| Shape {
+                kind: (model.geom_type()[geom], model.geom_dataid()[geom]),
+                size: model.geom_size()[geom],
+                place,
+            });
         Form {
             shapes: shapes.collect(),
             masses,
@@ -101,16 +96,14 @@ impl Scene {
 impl Form {
     /// Whether a rotation maps it onto itself.
     fn holds(&self, turn: Quat) -> bool {
-        let onto = |shape: &Shape| {
-            self.shapes
-                .iter()
-                .any(|other| shape.turned(turn).fills(other))
-        };
-        !self.moves && self.keeps_masses(turn) && self.shapes.iter().all(onto)
+        let mut turned = self.shapes.iter().map(|shape| shape.turned(turn));
+        !self.moves
+            && self.keeps_masses(turn)
+            && turned.all(|shape| self.shapes.iter().any(|other| shape.fills(other)))
     }
 
     fn keeps_masses(&self, turn: Quat) -> bool {
-        let own = self.moments([1.0, 0.0, 0.0, 0.0]);
+        let own = self.moments(quat::IDENTITY);
         let turned = self.moments(turn);
         let largest = |values: &[f64]| values.iter().fold(0.0, |most: f64, x| most.max(x.abs()));
         // A centre of mass that is off by a rounding error does not count.

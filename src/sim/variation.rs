@@ -105,10 +105,7 @@ impl Simulation {
         if changes.is_empty() {
             return;
         }
-        let mut model = match self.spare.take() {
-            Some(model) => model,
-            None => (*scene.model).clone(),
-        };
+        let mut model = self.spare.take().unwrap_or_else(|| (*scene.model).clone());
         // SAFETY: MuJoCo copies one model over another of the same sizes. It checks the sizes of their buffers itself, and ends the
         // process if they differ. Both have been models of this simulation, which takes no others.
         unsafe { mj_copyModel(model.ffi_mut(), scene.model.ffi()) };
@@ -128,11 +125,9 @@ fn changed(mut model: MjModel, changes: &[Change]) -> MjModel {
         return model;
     }
     WORKSPACE.with_borrow_mut(|kept| {
-        let fits = |data: &MjData<Box<MjModel>>| data.model().is_compatible_with_model(&model);
-        let workspace = match kept.take().filter(fits) {
-            Some(workspace) => kept.insert(workspace),
-            None => kept.insert(MjData::new(Box::new(model.clone()))),
-        };
+        let fitting = kept.take_if(|data| data.model().is_compatible_with_model(&model));
+        let workspace =
+            kept.insert(fitting.unwrap_or_else(|| MjData::new(Box::new(model.clone()))));
         let between = workspace.swap_model(Box::new(model));
         workspace.set_const();
         *workspace.swap_model(between)

@@ -40,18 +40,14 @@ impl Viewer {
         };
         let mut viewer =
             attempt(build).map_err(|reason| anyhow!("cannot open a window: {reason}{HELP}"))?;
-        let controls = Controls {
-            paused: false,
-            speed: 1.0,
-            choice: first,
-            steps: 0,
-            reset: false,
-            new_goal: false,
-        };
         let panel = Rc::new(RefCell::new(Panel {
             choices,
             readout: Readout::default(),
-            controls,
+            controls: Controls {
+                speed: 1.0,
+                choice: first,
+                ..Controls::default()
+            },
         }));
         let shown = panel.clone();
         viewer.add_ui_callback(move |ui, _| shown.borrow_mut().show(ui));

@@ -19,10 +19,7 @@ use crate::spaces::Spaces;
 use loss::Batch;
 
 /// The gradient backend in candle.
-pub struct Reference {
-    /// Its settings.
-    pub config: PpoConfig,
-}
+pub struct Reference;
 
 /// Gathers these samples of a rollout.
 fn gathered(policy: &Policy, rollout: &Rollout, samples: &[u32]) -> Result<Batch> {
@@ -61,6 +58,7 @@ impl GradientBackend for Reference {
     fn gradients(
         &mut self,
         policy: &Policy,
+        config: &PpoConfig,
         rollout: &Rollout,
         groups: &[&[u32]],
         count: usize,
@@ -83,7 +81,7 @@ impl GradientBackend for Reference {
                 &batch.observations,
                 &mut variables,
             )?;
-            let (total, losses) = loss::losses(&self.config, &batch, &means, &values)?;
+            let (total, losses) = loss::losses(config, &batch, &means, &values)?;
             sums.push(losses);
             let grads = (total * (group.len() as f64 / count as f64))?.backward()?;
             let mut gradient = vec![0.0; policy.layout.count()];
@@ -107,16 +105,7 @@ fn forward(
     variables: &mut Vec<(Range<usize>, Var)>,
 ) -> Result<Tensor> {
     let mut x = x.clone();
-    for (
-        i,
-        Layer {
-            inputs,
-            outputs,
-            weight,
-            bias,
-        },
-    ) in layers.iter().enumerate()
-    {
+    for (i, layer) in layers.iter().enumerate() {
         let mut variable = |range: &Range<usize>, shape: &[usize]| -> Result<Tensor> {
             let variable = Var::from_slice(&policy.parameters[range.clone()], shape, &Device::Cpu)?;
             variables.push((range.clone(), variable.clone()));
@@ -129,11 +118,9 @@ fn forward(
                 Activation::Tanh => x.tanh(),
             }?;
         }
-        let layer = Linear::new(
-            variable(weight, &[*outputs, *inputs])?,
-            Some(variable(bias, &[*outputs])?),
-        );
-        x = layer.forward(&x)?;
+        let weight = variable(&layer.weight, &[layer.outputs, layer.inputs])?;
+        let bias = variable(&layer.bias, &[layer.outputs])?;
+        x = Linear::new(weight, Some(bias)).forward(&x)?;
     }
     Ok(x)
 }

@@ -28,9 +28,9 @@ struct Dots(());
 /// # Errors
 /// Fails if it does not have them.
 pub fn request() -> Result<&'static dyn Unit, &'static str> {
-    let there = std::arch::is_x86_feature_detected!("avx512f")
-        && std::arch::is_x86_feature_detected!("avx512bf16");
-    if there {
+    if std::arch::is_x86_feature_detected!("avx512f")
+        && std::arch::is_x86_feature_detected!("avx512bf16")
+    {
         Ok(&Dots(()))
     } else {
         Err("it has no bf16 dot products (AVX-512 BF16)")

@@ -15,7 +15,6 @@ const LARGEST_SMALL: usize = 16 * 16;
 /// One network with the current parameters.
 pub(crate) struct Net<'a> {
     layers: Vec<Dense<'a>>,
-    activation: Activation,
 }
 
 /// A dense layer.
@@ -30,6 +29,7 @@ struct Dense<'a> {
     bias: &'a [f32],
     inputs: usize,
     outputs: usize,
+    activation: Option<Activation>,
 }
 
 /// Buffers for passing a block of up to `rows` rows through nets with the same hidden layers.
@@ -87,7 +87,7 @@ impl<'a> Net<'a> {
         parameters: &'a [f32],
         activation: Activation,
     ) -> Self {
-        let layer = |layer: &parameters::Layer| Dense {
+        let layer = |(i, layer): (usize, &parameters::Layer)| Dense {
             weight: Matrix::new(
                 &parameters[layer.weight.clone()],
                 layer.outputs,
@@ -98,10 +98,10 @@ impl<'a> Net<'a> {
             bias: &parameters[layer.bias.clone()],
             inputs: layer.inputs,
             outputs: layer.outputs,
+            activation: (i + 1 < layers.len()).then_some(activation),
         };
         Self {
-            layers: layers.iter().map(layer).collect(),
-            activation,
+            layers: layers.iter().enumerate().map(layer).collect(),
         }
     }
 
@@ -133,11 +133,6 @@ impl<'a> Net<'a> {
         self.layers.last().expect("a net has layers").outputs
     }
 
-    /// The activation after layer `l`, or none after the last one.
-    fn activation_of(&self, l: usize) -> Option<Activation> {
-        (l + 1 < self.layers.len()).then_some(self.activation)
-    }
-
     /// Runs the first `rows` rows of the inputs through the net and returns its outputs `[rows, outputs]`.
     pub(crate) fn forward<'w>(&self, rows: usize, work: &'w mut Workspace) -> &'w [f32] {
         for (l, layer) in self.layers.iter().enumerate() {
@@ -147,7 +142,7 @@ impl<'a> Net<'a> {
             let packed = layer.packed[0].as_ref();
             work.multiplier
                 .product(y, layer.x(x, rows), layer.weight_t(rows), packed, false);
-            add_bias(y, layer.bias, self.activation_of(l));
+            add_bias(y, layer.bias, layer.activation);
         }
         &work.outputs[self.layers.len() - 1][..rows * self.outputs()]
     }
@@ -175,7 +170,7 @@ impl<'a> Net<'a> {
             slopes_and_sums(
                 grad,
                 &work.outputs[l][..grad.len()],
-                self.activation_of(l),
+                layer.activation,
                 bias_grad,
             );
             let grad = Matrix::new(grad, rows, layer.outputs);

@@ -9,7 +9,7 @@ use super::amx::request as tiles;
 #[cfg(target_arch = "x86_64")]
 use super::avx512::request as dots;
 use super::bf16::{Order, Packed, Unit};
-use super::product::Matrix;
+use super::product::{Matrix, product};
 
 /// A unit, or why there is none.
 type Answer<E> = Result<&'static dyn Unit, E>;
@@ -47,13 +47,10 @@ pub fn request() -> Result<&'static dyn Unit> {
 }
 
 fn checked(unit: Answer<&'static str>, wrong: &'static str) -> Answer<&'static str> {
-    unit.and_then(|unit| {
-        if multiplies_rightly(unit) {
-            Ok(unit)
-        } else {
-            Err(wrong)
-        }
-    })
+    match unit {
+        Ok(unit) if !multiplies_rightly(unit) => Err(wrong),
+        answer => answer,
+    }
 }
 
 /// Whether products of whole numbers, which need no rounding, are exact.
@@ -61,31 +58,27 @@ fn multiplies_rightly(unit: &dyn Unit) -> bool {
     let rows = 37;
     let depth = 70;
     let columns = 50;
-    let numbers = |count: usize, step: usize| {
-        (0..count)
-            .map(|i| (i * step % 17) as f32 - 8.0)
-            .collect::<Vec<f32>>()
+    let numbers = |count: usize, step: usize| -> Vec<f32> {
+        let number = |i: usize| (i * step % 17) as f32 - 8.0;
+        (0..count).map(number).collect()
     };
     let a = numbers(rows * depth, 5);
     let b = numbers(depth * columns, 3);
-    let by_rows = Matrix::new(&a, rows, depth);
-    let by_columns = Matrix::new(&a, depth, rows).transposed();
-    [by_rows, by_columns].into_iter().all(|a| {
-        let mut lhs = Packed::default();
-        let mut rhs = Packed::default();
-        lhs.pack(a, unit.order_of_left(a));
-        rhs.pack(Matrix::new(&b, depth, columns).transposed(), Order::Pairs);
-        let mut out = vec![1.0; rows * columns];
-        unit.product(&mut out, columns, [&lhs, &rhs], true);
-        let [down, right] = a.strides().map(|stride| stride as usize);
-        (0..rows * columns).all(|i| {
-            let row = i / columns;
-            let column = i % columns;
-            let terms =
-                (0..depth).map(|k| a.data()[row * down + k * right] * b[k * columns + column]);
-            out[i] == 1.0 + terms.sum::<f32>()
+    let b = Matrix::new(&b, depth, columns);
+    let of_columns = Matrix::new(&a, depth, rows).transposed();
+    [Matrix::new(&a, rows, depth), of_columns]
+        .into_iter()
+        .all(|a| {
+            let mut lhs = Packed::default();
+            let mut rhs = Packed::default();
+            lhs.pack(a, unit.order_of_left(a));
+            rhs.pack(b.transposed(), Order::Pairs);
+            let mut out = vec![1.0; rows * columns];
+            let mut expected = out.clone();
+            unit.product(&mut out, columns, [&lhs, &rhs], true);
+            product(&mut expected, a, b, true);
+            out == expected
         })
-    })
 }
 
 #[cfg(test)]

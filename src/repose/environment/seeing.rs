@@ -14,11 +14,8 @@ impl Repose {
     /// Records what the rewards of a step depend on, after its physics.
     pub fn measure(&mut self, rot_dist_before: f64) {
         let object = self.object();
-        let object_velocity = self.sim.free_velocity(&self.task.hand.object);
         let task = &self.task;
         let last = &mut self.last;
-        let qpos = self.sim.qpos();
-        let qvel = self.sim.qvel();
         let offset =
             [0, 1, 2].map(|axis| object.position[axis] - task.config.goal_position.value[axis]);
         last.goal = self.goal;
@@ -27,13 +24,6 @@ impl Repose {
         last.goal_dist = quat::length(&offset);
         last.within = last.rot_dist <= self.lesson.tolerance;
         last.dropped = last.goal_dist >= task.config.fall_dist;
-        last.object = object;
-        last.object_velocity = object_velocity;
-        let cells = last.joint_pos.iter_mut().zip(&mut last.joint_vel);
-        for ((angle, speed), joint) in cells.zip(&task.hand.joints) {
-            *angle = qpos[joint.qpos];
-            *speed = qvel[joint.dof];
-        }
     }
 
     /// Writes the observation of the current state as the policy sees it: predicted, if the task asks for it, and mirrored, if its hand is
@@ -52,7 +42,6 @@ impl Repose {
         let Some(predictor) = &task.predictor else {
             return;
         };
-        let targets = self.servos.last(task.config.prediction as usize);
         let goal = Pose {
             position: task.goal_place(),
             orientation: self.goal,
@@ -62,7 +51,7 @@ impl Repose {
             task.config.vel_obs_scale,
             observation,
             goal,
-            &targets,
+            &self.servos.last(task.config.prediction as usize),
         ) {
             Some(sim) => {
                 self.write(&sim, observation);
