@@ -302,19 +302,8 @@ fn name_of(place: &Path) -> String {
     } else {
         whole.file_stem()
     };
-    let name = name.map_or_else(
-        || place.display().to_string(),
-        |n| n.to_string_lossy().into(),
-    );
-    name.chars()
-        .map(|c| {
-            if c.is_control() {
-                char::REPLACEMENT_CHARACTER
-            } else {
-                c
-            }
-        })
-        .collect()
+    let name = name.unwrap_or(place.as_os_str()).to_string_lossy();
+    name.replace(char::is_control, "\u{fffd}")
 }
 
 /// The means over consecutive windows of these numbers of rows, `[x, value]`. Rows without a value are skipped, as are windows with

@@ -18,8 +18,8 @@ impl Config {
             same.env.model = BUILTIN_MODEL.into();
             same
         });
-        let differing = own.compared_with(&other).into_iter();
-        differing
+        own.compared_with(&other)
+            .into_iter()
             .map(|(key, [own, other])| format!("{key} = {other}, not {own}"))
             .collect()
     }
@@ -36,9 +36,11 @@ impl Config {
             };
             same.flat()
         });
-        let both = own.into_iter().zip(other);
-        let both = both.map(|((key, own), (_, other))| (key, [own, other]));
-        both.filter(|(_, [own, other])| own != other).collect()
+        own.into_iter()
+            .zip(other)
+            .map(|((key, own), (_, other))| (key, [own, other]))
+            .filter(|(_, [own, other])| own != other)
+            .collect()
     }
 
     /// All settings by dotted key, except settings that only divide the work, each of one type in every run: what may be a ramp or a
@@ -102,16 +104,15 @@ pub fn short(value: &Value) -> String {
 /// A value as part of another one, where text has quotes.
 fn inner(value: &Value) -> String {
     match value {
-        Value::Array(values) => format!(
-            "[{}]",
-            values.iter().map(inner).collect::<Vec<_>>().join(",")
-        ),
+        Value::Array(values) => {
+            let values = Vec::from_iter(values.iter().map(inner));
+            format!("[{}]", values.join(","))
+        }
         Value::Table(parts) => {
-            let parts: Vec<_> = parts
+            let parts = parts
                 .iter()
-                .map(|(key, value)| format!("{key}={}", inner(value)))
-                .collect();
-            format!("{{{}}}", parts.join(","))
+                .map(|(key, value)| format!("{key}={}", inner(value)));
+            format!("{{{}}}", Vec::from_iter(parts).join(","))
         }
         Value::Float(x) => brief(*x),
         value => value.to_string(),

@@ -15,12 +15,9 @@ pub static DEFAULTS: LazyLock<Table> =
 
 /// The settings of all sections of a table, each with its dotted key.
 pub fn settings(table: &Table) -> impl Iterator<Item = (String, &Value)> {
-    let sections = table
-        .iter()
-        .filter_map(|(section, keys)| Some((section, keys.as_table()?)));
-    sections.flat_map(|(section, keys)| {
-        keys.iter()
-            .map(move |(key, value)| (format!("{section}.{key}"), value))
+    table.iter().flat_map(|(section, keys)| {
+        let keys = keys.as_table().into_iter().flatten();
+        keys.map(move |(key, value)| (format!("{section}.{key}"), value))
     })
 }
 
@@ -93,15 +90,14 @@ fn with_zeros(text: &str) -> String {
         let joined = i > 0 && bytes[i - 1].is_ascii_alphanumeric();
         bytes[i] == b'.' && !joined && bytes.get(i + 1).is_some_and(u8::is_ascii_digit)
     };
-    text.char_indices()
-        .map(|(i, c)| {
-            if begins(i) {
-                "0.".to_owned()
-            } else {
-                c.to_string()
-            }
-        })
-        .collect()
+    let mut filled = String::new();
+    for (i, c) in text.char_indices() {
+        if begins(i) {
+            filled.push('0');
+        }
+        filled.push(c);
+    }
+    filled
 }
 
 /// Whether a value of `env.model` names the scene at the absolute path `stored`.
@@ -172,21 +168,16 @@ pub fn overlay(
 
 /// What a value sets in a table of the base, if it fits: a plain number in place of a ramp is a constant.
 fn inner(expected: &Table, value: &Value) -> Option<Table> {
-    if is_ramp(expected) && number(value).is_some() {
+    let mut given = if is_ramp(expected) && number(value).is_some() {
         let parts = [
             ("from", value.clone()),
             ("to", value.clone()),
             ("steps", 0.into()),
-            ("after", 0.into()),
         ];
-        return Some(
-            parts
-                .into_iter()
-                .map(|(part, value)| (part.to_owned(), value))
-                .collect(),
-        );
-    }
-    let mut given = value.as_table()?.clone();
+        Table::from_iter(parts.map(|(part, value)| (part.to_owned(), value)))
+    } else {
+        value.as_table()?.clone()
+    };
     // A complete ramp without `after` starts at step 0, even if the default has an `after`. `to_text` relies on this.
     if is_ramp(expected)
         && ["from", "to", "steps"]
@@ -211,23 +202,18 @@ fn typed(expected: &Value, value: &Value) -> Result<Value, String> {
         }
         (Array(expected), Array(values)) => {
             // An empty list is a list of names.
-            let one = expected
-                .first()
-                .cloned()
-                .unwrap_or(Value::String(String::new()));
-            let typed: Result<Vec<_>, _> = values.iter().map(|v| typed(&one, v)).collect();
+            let one = expected.first().cloned().unwrap_or("".into());
+            let typed: Result<_, _> = values.iter().map(|value| typed(&one, value)).collect();
             typed
                 .map(Array)
                 .map_err(|rule| format!("an array of values that are each {rule}"))
         }
         (Value::Table(_), Value::String(text)) if text.starts_with('{') => {
             // A `--set` whose text could not be parsed.
-            let reason = format!("value = {}", with_zeros(text))
-                .parse::<Table>()
-                .err();
-            let reason = reason.map_or_else(String::new, |error| {
-                format!(": {}", shortened(error.message().trim()))
-            });
+            let reason = match format!("value = {}", with_zeros(text)).parse::<Table>() {
+                Ok(_) => String::new(),
+                Err(error) => format!(": {}", shortened(error.message().trim())),
+            };
             Err(format!("a table of TOML{reason}"))
         }
         _ => Err(type_of(expected)),

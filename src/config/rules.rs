@@ -8,7 +8,6 @@ use toml::{Table, Value};
 use super::overlay::{brief, lookup, number, settings};
 use super::settings::{Backend, Config, PpoConfig, Precision};
 use crate::os::shortened;
-use crate::sim::Parts;
 
 /// Keys, separated by spaces, the rule for their numbers, and its text.
 type Range = (&'static str, fn(f64) -> bool, &'static str);
@@ -89,7 +88,7 @@ pub fn violations(config: &Config) -> Vec<String> {
     }
     magnitudes(&table, &mut rules);
     env(config, &mut rules);
-    hand(config, &mut rules);
+    hand(&table, &mut rules);
     randomization(config, &table, &mut rules);
     nets(config, &mut rules);
     samples(config, &mut rules);
@@ -106,22 +105,11 @@ fn magnitudes(table: &Table, rules: &mut Rules) {
         } else {
             most
         };
-        let values = floats(value);
-        if let Some(&x) = values.iter().find(|x| x.abs() > most) {
-            rules.check(
-                false,
-                &key,
-                brief(x),
-                format!("be at most {} in magnitude", brief(most)),
-            );
-        }
-        if let Some(&x) = values.iter().find(|x| **x != 0.0 && x.abs() < least) {
-            rules.check(
-                false,
-                &key,
-                brief(x),
-                format!("be 0, or at least {least:e} in magnitude"),
-            );
+        for x in floats(value) {
+            let rule = format!("be at most {} in magnitude", brief(most));
+            rules.check(x.abs() <= most, &key, brief(x), rule);
+            let rule = format!("be 0, or at least {least:e} in magnitude");
+            rules.check(x == 0.0 || x.abs() >= least, &key, brief(x), rule);
         }
     }
 }
@@ -136,36 +124,19 @@ fn floats(value: &Value) -> Vec<f64> {
     }
 }
 
-fn hand(config: &Config, rules: &mut Rules) {
-    let Parts {
-        joints,
-        actuators,
-        fingertips,
-        object,
-        goal,
-        start,
-    } = &config.hand;
-    let lists = [
-        ("hand.joints", joints),
-        ("hand.actuators", actuators),
-        ("hand.fingertips", fingertips),
-    ];
-    let listed = lists
-        .into_iter()
-        .flat_map(|(key, names)| names.iter().map(move |name| (key, name)));
-    let single = [
-        ("hand.object", object),
-        ("hand.goal", goal),
-        ("hand.start", start),
-    ];
-    for (key, name) in listed.chain(single.into_iter().filter(|(_, name)| !name.is_empty())) {
-        let fits = !name.is_empty() && name.len() <= 200 && !name.contains(char::is_control);
-        rules.check(
-            fits,
-            key,
-            shortened(name),
-            "hold names of 1 to 200 bytes without control characters",
-        );
+fn hand(table: &Table, rules: &mut Rules) {
+    for (key, value) in settings(table).filter(|(key, _)| key.starts_with("hand.")) {
+        let names = match value {
+            Value::Array(names) => &names[..],
+            // It names nothing.
+            Value::String(name) if name.is_empty() => &[],
+            name => std::slice::from_ref(name),
+        };
+        for name in names.iter().filter_map(Value::as_str) {
+            let fits = (1..=200).contains(&name.len()) && !name.contains(char::is_control);
+            let rule = "hold names of 1 to 200 bytes without control characters";
+            rules.check(fits, &key, name, rule);
+        }
     }
 }
 
@@ -285,8 +256,8 @@ fn nets(config: &Config, rules: &mut Rules) {
         &sizes,
         "hold one to 64 sizes from 1 to 16384",
     );
-    let weights = hidden.windows(2).fold(0_usize, |sum, pair| {
-        sum.saturating_add(pair[0].saturating_mul(pair[1]))
+    let weights = hidden.array_windows().fold(0_usize, |sum, [a, b]| {
+        sum.saturating_add(a.saturating_mul(*b))
     });
     rules.check(
         weights <= 1 << 25,

@@ -7,7 +7,7 @@ use anyhow::Result;
 use color_quant::NeuQuant;
 use gif::{DisposalMethod, Encoder, Frame, Repeat};
 
-use super::format::{FilmFormat, Frames};
+use super::format::FilmFormat;
 
 /// The number of colours in the palette. The index after them leaves a pixel unchanged.
 const COLOURS: usize = 255;
@@ -21,20 +21,19 @@ const PIXELS_FOR_PALETTE: usize = 400_000;
 ///
 /// # Errors
 /// Fails if the pictures are too large for a GIF, or if the file cannot be written.
-pub fn encode(file: impl Write, format: FilmFormat, frames: Frames) -> Result<()> {
+pub fn encode(
+    file: impl Write,
+    format: FilmFormat,
+    mut frames: impl Iterator<Item = Vec<u8>>,
+) -> Result<()> {
     let [width, height] = format.size.map(|pixels| pixels as usize);
-    let waiting: Vec<_> = Iterator::take(
-        &mut *frames,
-        BYTES_FOR_PALETTE / (3 * width * height).max(1),
-    )
-    .collect();
+    let most = BYTES_FOR_PALETTE / (3 * width * height).max(1);
+    let waiting: Vec<_> = frames.by_ref().take(most).collect();
     let mut palette = Palette::new(&waiting);
-    let columns = u16::try_from(width)?;
-    let rows = u16::try_from(height)?;
     let mut encoder = Encoder::new(
         BufWriter::new(file),
-        columns,
-        rows,
+        width.try_into()?,
+        height.try_into()?,
         &palette.quantizer.color_map_rgb(),
     )?;
     encoder.set_repeat(Repeat::Infinite)?;
