@@ -330,6 +330,14 @@ impl Source {
         }
     }
 
+    /// The configuration that it makes over the base.
+    ///
+    /// # Errors
+    /// Fails as [`Settings::resolve`] does.
+    pub fn resolve(self) -> Result<Config> {
+        Settings::new().file(self).resolve()
+    }
+
     /// Its settings. The base itself counts as setting nothing.
     fn table(&self) -> Result<Table> {
         if self.text == BASE {

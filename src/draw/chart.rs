@@ -16,7 +16,7 @@ pub struct Subplot {
     /// Curves, at the places of their names in the legend.
     pub curves: Vec<Curve>,
     /// The word that is shown if no curve has a point.
-    pub nothing: String,
+    pub nothing: &'static str,
 }
 
 /// A line through points.
@@ -35,7 +35,7 @@ pub struct Chart {
     /// The names of the curves, in the order that all panels have them.
     pub legend: Vec<String>,
     /// The label of the x axis.
-    pub along: String,
+    pub along: &'static str,
     /// Panels, from top to bottom.
     pub panels: Vec<Subplot>,
     /// Width and height in pixels. By default 800 wide, and as high as the legend plus 260 for each panel.
@@ -210,7 +210,7 @@ impl Picture for Chart {
         let count = self.panels.len();
         let parts = below.split_evenly((count, 1));
         for ((panel, part), number) in self.panels.iter().zip(parts).zip(1..) {
-            let along = (number == count).then_some(&self.along[..]);
+            let along = (number == count).then_some(self.along);
             panel.draw(&part, x.clone(), along)?;
         }
         Ok(area.present()?)
@@ -312,7 +312,7 @@ impl Subplot {
             let (width, height) = part.dim_in_pixel();
             draw_text(
                 part,
-                &self.nothing,
+                self.nothing,
                 (width as i32 / 2, height as i32 / 2),
                 (HPos::Center, 15, BLACK),
             )?;

@@ -58,12 +58,14 @@ pub fn play(args: &PlayArgs, requests: &Requests) -> Result<ExitCode> {
         Plan::Robustness(report) => {
             requests.wait_for_end();
             let stage = Stage::set(place, args)?;
-            let load =
-                |changes: &[Override]| task(stage.loaded(), &[&args.set[..], changes].concat());
+            let load = |changes: &[Override]| {
+                task(stage.policy.as_ref(), &[&args.set[..], changes].concat())
+            };
+            let actor = stage.actor();
             robustness(
                 &load,
-                &stage.actor(),
-                &stage.place(),
+                &actor,
+                &stage.origin().unwrap_or(actor.name().to_owned()),
                 episodes(args, 256),
                 &report,
                 requests,

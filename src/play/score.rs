@@ -56,10 +56,9 @@ pub fn score(
         return Ok(os::exit_code(requests.signal()));
     };
     files.finish(&about(stage, episodes.seed))?;
-    played
-        .divergence()
-        .into_iter()
-        .for_each(|warning| say!("warning: {warning}"));
+    if let Some(warning) = played.divergence() {
+        say!("warning: {warning}");
+    }
     if outputs.json {
         os::print(&format!(
             "{}\n",

@@ -63,22 +63,17 @@ pub fn end(succeeded: bool) -> Result<Vec<Summary_Value>> {
 }
 
 /// The message `SessionStartInfo`.
-fn start_info(settings: &Table) -> Result<Vec<u8>> {
-    let entries: Result<Vec<_>> = settings
-        .iter()
-        .map(|(key, value)| entry(key, value))
-        .collect();
-    let entries = entries?;
+fn start_info(settings: &Table) -> ProtobufResult<Vec<u8>> {
     message(|out| {
-        entries
-            .iter()
-            .try_for_each(|entry| out.write_bytes(1, entry))?;
+        for (key, value) in settings {
+            out.write_bytes(1, &entry(key, value)?)?;
+        }
         out.write_double(5, now())
     })
 }
 
 /// An entry of the map of settings: a key, and a `google.protobuf.Value`.
-fn entry(key: &str, value: &Value) -> Result<Vec<u8>> {
+fn entry(key: &str, value: &Value) -> ProtobufResult<Vec<u8>> {
     let value = message(|out| match value {
         Value::Integer(x) => out.write_double(2, *x as f64),
         Value::Float(x) => out.write_double(2, *x),
@@ -111,7 +106,9 @@ fn session_value(name: &str, field: u32, info: &[u8]) -> Result<Summary_Value> {
     Ok(value)
 }
 
-fn message(write: impl FnOnce(&mut CodedOutputStream) -> ProtobufResult<()>) -> Result<Vec<u8>> {
+fn message(
+    write: impl FnOnce(&mut CodedOutputStream) -> ProtobufResult<()>,
+) -> ProtobufResult<Vec<u8>> {
     let mut bytes = Vec::new();
     let mut out = CodedOutputStream::vec(&mut bytes);
     write(&mut out)?;

@@ -42,31 +42,24 @@ pub fn expect_output<'a>(
             read.display()
         );
     }
-    let Some(whole) = final_path(path) else {
-        return Ok(());
-    };
+    let whole = final_path(path).unwrap_or_default();
     let Some((folder, name)) = whole.parent().zip(whole.file_name()) else {
         return Ok(());
     };
     let inside = folder.ends_with(CHECKPOINTS) || folder.ends_with(DIVERGED);
-    let run = RunFolder::at(
-        folder
-            .parent()
-            .filter(|_| inside)
-            .unwrap_or(folder)
-            .to_owned(),
-    );
+    let place = folder.parent().filter(|_| inside).unwrap_or(folder);
+    let run = RunFolder::at(place.to_owned());
     let is_run = run.checkpoints.begun() || run.path().join(LOCK).exists();
     let is_kept = if inside {
         is_one_of(name, &INSIDE)
     } else {
         name == FINISHED || is_one_of(name, &OURS)
     };
-    let place = run.path().display();
     ensure!(
         !is_run || !is_kept,
-        "{}: the run {place} reserves this file name; choose another name",
-        path.display()
+        "{}: the run {} reserves this file name; choose another name",
+        path.display(),
+        place.display()
     );
     Ok(())
 }
@@ -77,9 +70,8 @@ pub fn expect_output<'a>(
 /// Fails if it does.
 pub fn expect_other_policy(folder: &Path, init: &Path) -> Result<()> {
     let own = RunFolder::at(folder.to_owned()).policy();
-    let replaces = same_file(&own, init);
     ensure!(
-        !replaces,
+        !same_file(&own, init),
         "{}: would replace the policy that the run starts from; choose another folder",
         own.display()
     );

@@ -58,12 +58,7 @@ pub fn runs(args: &RunsArgs) -> Result<()> {
         if runs.is_empty() && !args.watch {
             os::say!("there are no runs in this folder");
         }
-        let letters = if compared.is_some() {
-            &["A", "B"][..]
-        } else {
-            &[]
-        };
-        let mut lines = table(&runs, letters);
+        let mut lines = table(&runs, compared.is_some());
         lines.extend(compared.iter().flat_map(Comparison::lines));
         if !args.watch {
             return os::print(&text_of(&lines));
@@ -121,20 +116,14 @@ fn read(args: &RunsArgs, default: &Config, before: &[Run]) -> Result<Vec<Run>> {
         .collect())
 }
 
-/// The runs as lines, each with its letter if they have some.
-fn table(runs: &[Run], letters: &[&str]) -> Vec<String> {
-    let heads = HEADS.map(String::from).to_vec();
-    let rows = [heads].into_iter().chain(runs.iter().map(Run::cells));
-    let marks = [""]
-        .iter()
-        .chain(letters)
-        .map(|letter| vec![(*letter).to_owned()]);
-    let rows: Vec<Vec<String>> = match letters.len() {
-        0 => rows.collect(),
-        _ => marks
-            .zip(rows)
-            .map(|(mark, row)| [mark, row].concat())
-            .collect(),
-    };
-    aligned(&rows, WORDS + usize::from(!letters.is_empty()))
+/// The runs as lines. Two that are compared have letters.
+fn table(runs: &[Run], compared: bool) -> Vec<String> {
+    let mut rows = vec![HEADS.map(String::from).to_vec()];
+    rows.extend(runs.iter().map(Run::cells));
+    if compared {
+        for (row, letter) in rows.iter_mut().zip(["", "A", "B"]) {
+            row.insert(0, letter.into());
+        }
+    }
+    aligned(&rows, WORDS + usize::from(compared))
 }

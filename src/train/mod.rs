@@ -179,16 +179,12 @@ impl Session {
         let exchange = &self.agent.exchange;
         let ended = exchange.all_gather(pool.take_finished()).concat();
         let sums: Vec<StepSums> = pool.envs_mut().map(Repose::take_sums).collect();
-        let total = |sums: &[StepSums]| {
-            let mut total = StepSums::default();
-            sums.iter().for_each(|sums| total += *sums);
-            total
-        };
-        let steps = exchange.sum(&sums, total, |mut sum, more| {
+        let add = |mut sum: StepSums, more| {
             sum += more;
             sum
-        });
-        (ended, steps)
+        };
+        let total = |sums: &[StepSums]| sums.iter().copied().fold(StepSums::default(), add);
+        (ended, exchange.sum(&sums, total, add))
     }
 
     /// The histograms that are due after this iteration. Only the first rank has some.
