@@ -17,12 +17,11 @@ pub fn completions(shell: Shell) -> Result<()> {
     let mut program = command();
     if shell != Shell::Bash {
         clap_complete::generate(shell, &mut program, PROGRAM, &mut text);
-        let more = if shell == Shell::Fish {
-            after_commands(&program)
-        } else {
-            String::new()
-        };
-        return os::print(&(String::from_utf8(text)? + &more));
+        let mut text = String::from_utf8(text)?;
+        if shell == Shell::Fish {
+            text += &after_commands(&program);
+        }
+        return os::print(&text);
     }
     // For a name with a hyphen, clap_complete 4.6 gives each command two names in the script, and completes nothing after a command.
     clap_complete::generate(
@@ -43,27 +42,27 @@ fn after_commands(program: &clap::Command) -> String {
             .map(|of| of.get_name().to_owned())
             .collect()
     };
-    let values = |command: &clap::Command| {
-        let values = command
+    let values = |command: &clap::Command| -> Vec<String> {
+        command
             .get_positionals()
-            .flat_map(clap::Arg::get_possible_values);
-        values
+            .flat_map(clap::Arg::get_possible_values)
             .map(|value| value.get_name().to_owned())
-            .collect::<Vec<_>>()
+            .collect()
     };
     let commands = program
         .get_subcommands()
         .map(|command| (command.get_name(), values(command)));
-    let commands = commands
-        .chain([("help", names(program))])
-        .filter(|(_, words)| !words.is_empty());
-    let line = |(name, words): (&str, Vec<String>)| {
+    let line = |(name, words): (_, Vec<_>)| {
         let words = words.join(" ");
         format!(
             "complete -c {PROGRAM} -n \"__fish_shadow_repose_using_subcommand {name}\" -f -a \"{words}\"\n"
         )
     };
-    commands.map(line).collect()
+    commands
+        .chain([("help", names(program))])
+        .filter(|(_, words)| !words.is_empty())
+        .map(line)
+        .collect()
 }
 
 /// Prints a manual page of all commands.

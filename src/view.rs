@@ -99,14 +99,11 @@ fn task_for_display(config: &Config, look: &Look) -> Result<Arc<Task>> {
 /// Shows the scene on a page, with a slider for each actuator, for as long as the program runs.
 fn show_on_page(args: &ViewArgs, port: u16, task: &Arc<Task>, choice: usize) -> Result<()> {
     let sliders = see::Sliders::new(task);
-    let title = task
-        .config
-        .model_file()
-        .map_or("The built-in hand".into(), |file| {
-            file.display().to_string()
-        });
     let about = see::About {
-        title,
+        title: match task.config.model_file() {
+            Some(file) => file.display().to_string(),
+            None => "The built-in hand".into(),
+        },
         policy: None,
         seed: Some(args.seed),
     };

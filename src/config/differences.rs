@@ -2,9 +2,10 @@
 
 use toml::{Table, Value};
 
+use super::layers::MODEL;
 use super::overlay::{DEFAULTS, brief, lookup, settings};
 use super::ramp::Ramp;
-use super::settings::{BUILTIN_MODEL, Config, EnvConfig, RunConfig};
+use super::settings::{Config, EnvConfig};
 
 /// A setting by its dotted key, and its values in both configurations.
 pub type Difference = (String, [Value; 2]);
@@ -13,13 +14,9 @@ impl Config {
     /// Lists the settings that differ in `other`. Leaves out what may change during a run: the total number of steps, the
     /// number of threads and the path of the scene.
     pub fn differences(&self, other: &Self) -> Vec<String> {
-        let [own, other] = [self, other].map(|of| {
-            let mut same = of.clone();
-            same.env.model = BUILTIN_MODEL.into();
-            same
-        });
-        own.compared_with(&other)
+        self.compared_with(other)
             .into_iter()
+            .filter(|(key, _)| key != MODEL)
             .map(|(key, [own, other])| format!("{key} = {other}, not {own}"))
             .collect()
     }
@@ -28,12 +25,9 @@ impl Config {
     pub fn compared_with(&self, other: &Self) -> Vec<Difference> {
         let [own, other] = [self, other].map(|of| {
             let mut same = of.clone();
-            same.run = RunConfig {
-                total_steps: 0,
-                threads: 0,
-                shards: of.shards(),
-                ..same.run
-            };
+            same.run.total_steps = 0;
+            same.run.threads = 0;
+            same.run.shards = of.shards();
             same.flat()
         });
         own.into_iter()

@@ -102,8 +102,10 @@ fn with_zeros(text: &str) -> String {
 
 /// Whether a value of `env.model` names the scene at the absolute path `stored`.
 pub fn names_scene(asked: &Value, stored: &str) -> bool {
-    let file = asked.as_str().map(|asked| Path::new(asked).canonicalize());
-    file.is_some_and(|file| file.is_ok_and(|file| file == Path::new(stored)))
+    asked.as_str().is_some_and(|asked| {
+        let file = Path::new(asked).canonicalize();
+        file.is_ok_and(|file| file == Path::new(stored))
+    })
 }
 
 /// The maximum number of problems to report. The first ones are enough to start with.

@@ -62,18 +62,14 @@ impl Stage {
     /// # Errors
     /// Fails as [`Loaded::find`] and [`Loaded::task`] do.
     pub fn find(place: Option<&Path>, set: &[Override]) -> Result<Self> {
-        if let Some(choice) = place.and_then(Actor::without_policy) {
-            return Ok(Self {
-                policy: None,
-                choice,
-                task: task(None, set)?,
-            });
-        }
-        let policy = Some(Loaded::find(place, set)?);
+        let (policy, choice) = match place.and_then(Actor::without_policy) {
+            Some(choice) => (None, choice),
+            None => (Some(Loaded::find(place, set)?), 0),
+        };
         Ok(Self {
             task: task(policy.as_ref(), set)?,
             policy,
-            choice: 0,
+            choice,
         })
     }
 

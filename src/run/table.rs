@@ -64,11 +64,11 @@ pub fn read_metrics(place: &Path, required: &[&str], wanted: &[&str]) -> Result<
             shortened(&header)
         );
     }
-    let asked = required
+    let places: Vec<usize> = required
         .iter()
         .chain(wanted)
-        .map(|column| names.iter().position(|name| name == column));
-    let places: Vec<usize> = asked.flatten().collect();
+        .filter_map(|column| names.iter().position(|name| name == column))
+        .collect();
     let columns = read_columns(reader, &path, &places, names.len())?;
     let columns = places
         .iter()

@@ -77,7 +77,7 @@ impl Lead {
         report.descriptions = described(&tags);
         report.settings = config.to_text();
         report.hparams = config.dotted();
-        report.best = session.best.map(|[goals, _]| goals);
+        report.best = session.best.map_or(f64::NAN, |[goals, _]| goals);
         Self {
             report,
             saver,
