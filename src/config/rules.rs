@@ -71,9 +71,6 @@ pub const FARTHEST: f64 = 100.0;
 const LONGEST_PATH: usize = 4095;
 const LONGEST_NAME: usize = 255;
 
-/// The smallest and the largest magnitude of a nonzero value. Much is computed from these values in `f32`.
-const IN_F32: [f64; 2] = [1e-37, 1e38];
-
 /// Every rule that the values break, as "key = value: must …".
 pub fn violations(config: &Config) -> Vec<String> {
     let mut rules = Rules::default();
@@ -98,7 +95,8 @@ pub fn violations(config: &Config) -> Vec<String> {
 
 fn magnitudes(table: &Table, rules: &mut Rules) {
     let limited = ["env.", "training.", "randomization."];
-    let [least, most] = IN_F32;
+    // Much is computed from these values in `f32`.
+    let [least, most] = [1e-37, 1e38];
     for (key, value) in settings(table).filter(|(key, _)| key != "training.hold") {
         let most = if limited.iter().any(|section| key.starts_with(section)) {
             LARGEST

@@ -8,7 +8,6 @@ mod plan;
 mod score;
 mod stage;
 
-use std::path::Path;
 use std::process::ExitCode;
 
 use anyhow::{Result, bail};
@@ -45,7 +44,7 @@ pub fn play(args: &PlayArgs, requests: &Requests) -> Result<ExitCode> {
         Plan::Replay(trace, to, shot) => browser::from_trace(&trace, &to, &shot, &args.set),
         Plan::Web(port, shot) => {
             let followed = args.follow.then(|| Followed::find(place)).transpose()?;
-            let newest: Option<&Path> = followed.as_ref().map(|followed| &*followed.path);
+            let newest = followed.as_ref().map(|followed| &*followed.path);
             let stage = Stage::set(newest.or(place), args)?;
             browser::live(
                 ((port, args.shot.web_host.as_deref()), args.hands),

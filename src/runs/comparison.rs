@@ -43,7 +43,7 @@ impl Comparison {
         let mut begin = f64::NEG_INFINITY;
         let row = |step| {
             let figures = std::array::from_fn(|figure| {
-                [&curves[0], &curves[1]].map(|of| match COMPARED[figure] {
+                curves.each_ref().map(|of| match COMPARED[figure] {
                     ("eval", _) => value_at(&of[figure], step).unwrap_or(f64::NAN),
                     // The others are logged in every iteration.
                     _ => mean_between(&of[figure], begin, step),

@@ -78,10 +78,7 @@ impl Run {
         let stamp = glance.metrics.as_deref().and_then(os::stamp);
         let figures = match known.filter(|known| known.stamp == stamp) {
             Some(known) => (*known).clone(),
-            None => Figures {
-                stamp,
-                ..Figures::of(path, glance.metrics.is_some())
-            },
+            None => Figures::of(path, stamp),
         };
         problems.extend(figures.problem.clone());
         let total_steps = config.as_ref().map(|config| config.run.total_steps);
@@ -191,17 +188,17 @@ impl Run {
 
 impl Figures {
     /// Reads the table of a run, if it has one.
-    fn of(run: &Path, has_table: bool) -> Self {
+    fn of(run: &Path, stamp: Option<Stamp>) -> Self {
         let unknown = f64::NAN;
         let none = Self {
-            stamp: None,
+            stamp,
             env_steps: None,
             steps_per_s: unknown,
             goals: unknown,
             best_goals: unknown,
             problem: None,
         };
-        if !has_table {
+        if stamp.is_none() {
             return none;
         }
         let read = || -> Result<Self> {

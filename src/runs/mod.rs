@@ -4,11 +4,11 @@ mod comparison;
 mod found;
 
 use std::collections::HashMap;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::thread;
 use std::time::{Duration, SystemTime};
 
-use anyhow::{Context, Result, ensure};
+use anyhow::{Result, ensure};
 use rayon::prelude::*;
 use serde_json::{Value, json};
 
@@ -74,34 +74,27 @@ pub fn runs(args: &RunsArgs) -> Result<()> {
 /// Reads the runs at the places of `args`: one folder of runs, or runs themselves. Runs of a folder come newest first. A table that
 /// has not changed since it was read `before` is not read again.
 fn read(args: &RunsArgs, default: &Config, before: &[Run]) -> Result<Vec<Run>> {
-    let seen = |path: PathBuf| Glance::of(&path).map(|glance| (path, glance));
     let places = &args.places;
-    let all = |folder| -> Result<Vec<_>> {
-        Ok(run::folders_of_runs(folder, args.watch)?
-            .into_iter()
-            .filter_map(seen)
-            .collect())
-    };
-    let mut found: Vec<(PathBuf, Glance)> = match &places[..] {
-        [] => all(None)?,
-        [place] if Glance::of(place).is_none() => all(Some(place))?,
-        places => {
-            let runs = places
-                .iter()
-                .filter(|place| !args.watch || Glance::of(place).is_some())
-                .map(|place| {
-                    ensure!(place.exists(), "{}: no such folder", place.display());
-                    let no_run = || {
-                        format!(
-                            "{} holds no run; to list a folder of runs, name it alone",
-                            place.display()
-                        )
-                    };
-                    seen(place.clone()).with_context(no_run)
-                });
-            runs.collect::<Result<_>>()?
+    let (paths, are_runs) = match &places[..] {
+        [] => (run::folders_of_runs(None, args.watch)?, false),
+        [place] if Glance::of(place).is_none() => {
+            (run::folders_of_runs(Some(place), args.watch)?, false)
         }
+        places => (places.to_vec(), !args.watch),
     };
+    let mut found = Vec::new();
+    for path in paths {
+        let glance = Glance::of(&path);
+        if are_runs {
+            ensure!(path.exists(), "{}: no such folder", path.display());
+            ensure!(
+                glance.is_some(),
+                "{} holds no run; to list a folder of runs, name it alone",
+                path.display()
+            );
+        }
+        found.extend(glance.map(|glance| (path, glance)));
+    }
     if places.len() < 2 {
         found.sort_by(|(a, of_a), (b, of_b)| (of_b.begun, b).cmp(&(of_a.begun, a)));
     }

@@ -59,20 +59,17 @@ impl Session {
         let exchange = &self.agent.exchange;
         // With a single rank, the next iteration stops at once.
         let asked = !exchange.is_alone() && requests.stop.load(Ordering::Relaxed);
-        let weights = if exchange.is_alone() {
-            0
-        } else {
-            self.agent.ppo.checksum()
-        };
-        let signal = if asked { requests.signal() } else { 0 };
-        let vote = Vote {
+        let votes = exchange.all_gather(Vote {
             stop: by_file || asked,
             save: requests.take_save(),
             improved,
-            signal,
-            weights,
-        };
-        let votes = exchange.all_gather(vote);
+            signal: if asked { requests.signal() } else { 0 },
+            weights: if exchange.is_alone() {
+                0
+            } else {
+                self.agent.ppo.checksum()
+            },
+        });
         if let Some(rank) = votes
             .iter()
             .position(|vote| vote.weights != votes[0].weights)
@@ -105,18 +102,12 @@ impl Session {
             return Vec::new();
         }
         let iteration = self.agent.iteration;
-        let mut own: Vec<(String, String)> = Vec::new();
-        for Member {
-            env: hand,
-            number: env,
-            ..
-        } in self.agent.pool.members_mut()
-        {
-            let Some(diverged) = hand.diverged.take() else {
-                continue;
-            };
-            let text = diverged.as_json(&self.config.env, iteration, *env);
-            own.push((format!("iteration-{iteration:08}-env-{env}.json"), text));
+        let mut own = Vec::new();
+        for Member { env, number, .. } in self.agent.pool.members_mut() {
+            if let Some(diverged) = env.diverged.take() {
+                let text = diverged.as_json(&self.config.env, iteration, *number);
+                own.push((format!("iteration-{iteration:08}-env-{number}.json"), text));
+            }
         }
         self.agent.exchange.all_gather(own).concat()
     }

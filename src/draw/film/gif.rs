@@ -57,15 +57,13 @@ fn changes(palette: &mut Palette, width: usize, previous: &[u8], rgb: &[u8]) -> 
     let height = rgb.len() / (3 * width);
     let pixel = |x: usize, y: usize| 3 * (y * width + x)..3 * (y * width + x) + 3;
     let changed = |x: usize, y: usize| previous.get(pixel(x, y)) != rgb.get(pixel(x, y));
-    let rows: Vec<usize> = (0..height)
-        .filter(|&y| (0..width).any(|x| changed(x, y)))
-        .collect();
-    let top = *rows.first().unwrap_or(&0);
-    let bottom = *rows.last().unwrap_or(&0);
+    let in_row = |y: &usize| (0..width).any(|x| changed(x, *y));
+    let top = (0..height).find(in_row).unwrap_or(0);
+    let bottom = (top..height).rev().find(in_row).unwrap_or(top);
     let in_column = |x: &usize| (top..=bottom).any(|y| changed(*x, y));
     let left = (0..width).find(in_column).unwrap_or(0);
     let right = (left..width).rev().find(in_column).unwrap_or(left);
-    let mut pixels = Vec::with_capacity((right + 1 - left) * (bottom + 1 - top));
+    let mut pixels = Vec::new();
     for y in top..=bottom {
         for x in left..=right {
             pixels.push(if changed(x, y) {

@@ -87,7 +87,7 @@ pub fn encode(
 
 /// The units of a frame, each behind its length, as the file holds them.
 fn units_with_lengths(stream: &[u8]) -> Result<Vec<u8>> {
-    let mut data = Vec::with_capacity(stream.len());
+    let mut data = Vec::new();
     for unit in parse_annexb_nal_units(stream)? {
         // The parameter sets go into the index.
         if !matches!(
