@@ -108,12 +108,11 @@ fn show_on_page(args: &ViewArgs, port: u16, task: &Arc<Task>, choice: usize) -> 
         seed: Some(args.seed),
     };
     let own = sliders.clone();
-    let step = move |player: &mut Player| {
-        let (_, actor) = &Actor::WITHOUT_POLICY[choice];
-        player.step_changed(actor, |action| own.change(action))
-    };
     let acting = see::LiveActor {
-        step: Rc::new(step),
+        step: Rc::new(move |player: &mut Player| {
+            let (_, actor) = &Actor::WITHOUT_POLICY[choice];
+            player.step_changed(actor, |action| own.change(action))
+        }),
         policy: None,
         task: task.clone(),
     };

@@ -156,8 +156,10 @@ pub fn overlay(
         match typed(expected, value) {
             Ok(value) => drop(merged.insert(key.clone(), value)),
             Err(rule) => {
-                let number = value.as_float().filter(|x| x.is_finite());
-                let value = number.map_or_else(|| value.to_string(), brief);
+                let value = match value {
+                    Float(x) if x.is_finite() => brief(*x),
+                    value => value.to_string(),
+                };
                 problems.push(format!(
                     "{} = {}: must be {rule}",
                     shortened(&name),
@@ -252,19 +254,15 @@ fn unknown(name: &str) -> String {
                 .collect()
         }
     };
-    let alike = similar(name, known.iter().map(String::as_str), '.');
+    let known = || known.iter().map(String::as_str);
     let end = |key: &str| key.rsplit('.').next().unwrap_or_default().to_owned();
-    let holds = known
-        .iter()
-        .map(String::as_str)
-        .find(|key| last.len() > 2 && end(key).contains(last));
-    let near = alike
-        .into_iter()
-        .find(|key| strsim::damerau_levenshtein(&end(key), last) <= 1 + last.len() / 4);
-    let all = "configs/repose.toml lists all of them";
-    let hint = near
-        .or(holds)
-        .map_or(all.into(), |nearest| format!("did you mean {nearest}?"));
+    let is_near = |key: &&str| strsim::damerau_levenshtein(&end(key), last) <= 1 + last.len() / 4;
+    let holds = |key: &&str| last.len() > 2 && end(key).contains(last);
+    let near = similar(name, known(), '.').into_iter().find(is_near);
+    let hint = match near.or(known().find(holds)) {
+        Some(nearest) => format!("did you mean {nearest}?"),
+        None => "configs/repose.toml lists all of them".into(),
+    };
     format!("{}: unknown key; {hint}", shortened(name))
 }
 

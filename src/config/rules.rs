@@ -98,11 +98,8 @@ fn magnitudes(table: &Table, rules: &mut Rules) {
     // Much is computed from these values in `f32`.
     let [least, most] = [1e-37, 1e38];
     for (key, value) in settings(table).filter(|(key, _)| key != "training.hold") {
-        let most = if limited.iter().any(|section| key.starts_with(section)) {
-            LARGEST
-        } else {
-            most
-        };
+        let is_limited = limited.iter().any(|section| key.starts_with(section));
+        let most = if is_limited { LARGEST } else { most };
         for x in floats(value) {
             let rule = format!("be at most {} in magnitude", brief(most));
             rules.check(x.abs() <= most, &key, brief(x), rule);
@@ -156,23 +153,21 @@ fn env(config: &Config, rules: &mut Rules) {
     );
     let ratio = env.ctrl_dt / env.sim_dt;
     let whole = (1.0..=1e4).contains(&ratio.round()) && (ratio / ratio.round() - 1.0).abs() < 1e-6;
-    let rule = format!(
-        "be a whole multiple of env.sim_dt = {}, at most 10000 times it",
-        env.sim_dt
-    );
     rules.check(
         whole || ratio.is_nan() || ratio <= 0.0,
         "env.ctrl_dt",
         env.ctrl_dt,
-        rule,
+        format!(
+            "be a whole multiple of env.sim_dt = {}, at most 10000 times it",
+            env.sim_dt
+        ),
     );
     let steps = (env.max_episode_seconds / env.ctrl_dt).round();
-    let rule = "last between one and 1e9 steps of env.ctrl_dt";
     rules.check(
         (1.0..=1e9).contains(&steps),
         "env.max_episode_seconds",
         env.max_episode_seconds,
-        rule,
+        "last between one and 1e9 steps of env.ctrl_dt",
     );
 }
 
@@ -185,12 +180,11 @@ fn randomization(config: &Config, table: &Table, rules: &mut Rules) {
         else {
             continue;
         };
-        let name = format!("randomization.{key}");
-        let range = format!("[{low}, {high}]");
+
         rules.check(
             0.0 < *low && low <= high,
-            &name,
-            range,
+            &format!("randomization.{key}"),
+            format!("[{low}, {high}]"),
             "be [low, high] with 0 < low <= high",
         );
         let scale = format!("{key}_scale");
@@ -223,33 +217,32 @@ fn randomization(config: &Config, table: &Table, rules: &mut Rules) {
             format!("be at most {LONGEST_DELAY}"),
         );
     }
-    let is_seen = env.prediction == 0 || env.vel_obs_scale != 0.0;
     rules.check(
-        is_seen,
+        env.prediction == 0 || env.vel_obs_scale != 0.0,
         "env.vel_obs_scale",
         env.vel_obs_scale,
         "not be 0 with env.prediction: velocities must be observed",
     );
-    let rule =
-        format!("be, with env.action_delay, shorter than an episode, which lasts {steps} steps");
     let longest = env.action_delay.saturating_add(high);
     rules.check(
         high == 0 || longest < steps,
         "randomization.delay",
         &range,
-        rule,
+        format!("be, with env.action_delay, shorter than an episode, which lasts {steps} steps"),
     );
-    let rule = format!("be, with env.action_delay, at most {LONGEST_DELAY}");
-    rules.check(longest <= LONGEST_DELAY, "randomization.delay", range, rule);
+    rules.check(
+        longest <= LONGEST_DELAY,
+        "randomization.delay",
+        range,
+        format!("be, with env.action_delay, at most {LONGEST_DELAY}"),
+    );
 }
 
 fn nets(config: &Config, rules: &mut Rules) {
     let hidden = &config.ppo.hidden;
-    let sizes_fit =
-        (1..=64).contains(&hidden.len()) && hidden.iter().all(|h| (1..=16384).contains(h));
     let sizes = format!("{:?}", &hidden[..hidden.len().min(65)]);
     rules.check(
-        sizes_fit,
+        (1..=64).contains(&hidden.len()) && hidden.iter().all(|h| (1..=16384).contains(h)),
         "ppo.hidden",
         &sizes,
         "hold one to 64 sizes from 1 to 16384",
@@ -303,12 +296,10 @@ fn samples(config: &Config, rules: &mut Rules) {
 }
 
 fn learning(ppo: &PpoConfig, rules: &mut Rules) {
-    let computable = ppo.precision == Precision::F32 || ppo.backend == Backend::Fused;
-    let precision = Value::try_from(ppo.precision).expect("a string");
     rules.check(
-        computable,
+        ppo.precision == Precision::F32 || ppo.backend == Backend::Fused,
         "ppo.precision",
-        precision,
+        Value::try_from(ppo.precision).expect("a string"),
         "be \"f32\" with ppo.backend = \"candle\"",
     );
     let [low, high] = ppo.learning_rate_range;
@@ -331,11 +322,10 @@ fn learning(ppo: &PpoConfig, rules: &mut Rules) {
         "be [low, high] with 0 < low <= high",
     );
     let [near, far] = ppo.away_range;
-    let range = format!("[{near}, {far}]");
     rules.check(
         0.0 <= near && near < far,
         "ppo.away_range",
-        range,
+        format!("[{near}, {far}]"),
         "be [near, far] with 0 <= near < far",
     );
 }
@@ -370,8 +360,9 @@ impl Rules {
         match lookup(table, key).expect("a setting") {
             // The other parts of a ramp are counts of steps.
             Value::Table(parts) => {
-                let floats = parts.iter().filter(|(_, value)| value.is_float());
-                floats.for_each(|(part, value)| check(&format!("{key}.{part}"), value));
+                for (part, value) in parts.iter().filter(|(_, value)| value.is_float()) {
+                    check(&format!("{key}.{part}"), value);
+                }
             }
             value => check(key, value),
         }

@@ -282,8 +282,7 @@ impl PpoConfig {
     /// The number of samples in a minibatch of a rollout with this many samples and this horizon. It is the same for all
     /// horizons of a run.
     pub fn minibatch_of(&self, samples: usize, horizon: usize) -> usize {
-        let in_first = samples / (horizon / self.first_horizon());
-        in_first / self.minibatches
+        samples / (horizon / self.first_horizon()) / self.minibatches
     }
 
     /// How far a value may move from its value at collection time, or infinity if `value_clip` is 0.

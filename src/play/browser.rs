@@ -25,25 +25,22 @@ const BUILT_IN: &str = "built into the program";
 
 /// What a page says about who acts in episodes that are drawn from this seed.
 pub fn about(stage: &Stage, seed: u64) -> About {
-    let name = stage.described();
-    let policy = stage.origin().zip(name.as_deref());
+    let policy = stage.origin().zip(stage.described());
     described(stage.actor().name(), policy, Some(seed))
 }
 
 /// What a page says about an actor, the place and the description of its policy, and a seed.
-fn described(actor: &str, policy: Option<(String, &str)>, seed: Option<u64>) -> About {
-    let title = match &policy {
-        Some((place, _)) if place.ends_with(BUILT_IN) => "A built-in policy".to_owned(),
-        Some((place, _)) => place.clone(),
-        None => format!("{}{}", actor[..1].to_uppercase(), &actor[1..]),
-    };
-    let policy = policy.map(|(_, name)| match actor {
-        "policy" => name.to_owned(),
-        other => format!("{name} ({other})"),
-    });
+fn described(actor: &str, policy: Option<(String, String)>, seed: Option<u64>) -> About {
     About {
-        title,
-        policy,
+        title: match &policy {
+            Some((place, _)) if place.ends_with(BUILT_IN) => "A built-in policy".to_owned(),
+            Some((place, _)) => place.clone(),
+            None => format!("{}{}", actor[..1].to_uppercase(), &actor[1..]),
+        },
+        policy: policy.map(|(_, name)| match actor {
+            "policy" => name,
+            other => format!("{name} ({other})"),
+        }),
         seed,
     }
 }
@@ -205,8 +202,7 @@ fn of_trace(header: &Value) -> About {
         say!("warning: {warning}");
     }
     let policy = header["checkpoint"].as_str();
-    let name = policy.map(|place| with_warnings(place, warnings));
-    let policy = policy.map(str::to_owned).zip(name.as_deref());
+    let policy = policy.map(|place| (place.to_owned(), with_warnings(place, warnings)));
     described(actor, policy, header["seed"].as_u64())
 }
 

@@ -110,14 +110,12 @@ impl Stage {
 
     /// The actor of a page that shows this task.
     pub fn acting(self: Rc<Self>, task: Arc<Task>) -> LiveActor {
-        let policy = self.described();
-        let step = move |player: &mut Player| {
-            let (_, actor) = &self.actors_of(Policy::freeze_briefly)[self.choice];
-            player.step(actor)
-        };
         LiveActor {
-            step: Rc::new(step),
-            policy,
+            policy: self.described(),
+            step: Rc::new(move |player: &mut Player| {
+                let (_, actor) = &self.actors_of(Policy::freeze_briefly)[self.choice];
+                player.step(actor)
+            }),
             task,
         }
     }

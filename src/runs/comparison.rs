@@ -52,10 +52,9 @@ impl Comparison {
             begin = step;
             (step, figures)
         };
-        let rows = marks(&curves).into_iter().map(row).collect();
         Ok(Self {
             settings: configs.map(|(a, b)| a.compared_with(b)),
-            rows,
+            rows: marks(&curves).into_iter().map(row).collect(),
         })
     }
 

@@ -197,7 +197,7 @@ impl Columns {
         for (key, value) in more.as_object().into_iter().flatten() {
             meta[key] = value.clone();
         }
-        let counts = [0, 2, 3].map(|scalar| self.poses() + scalar).to_vec();
+
         let mut scene = self.drawing.scene.take();
         scene["start"] = json!(self.drawing.start);
         Page {
@@ -205,7 +205,7 @@ impl Columns {
             scene,
             meshes: std::mem::take(&mut self.drawing.meshes),
             rows,
-            counts,
+            counts: [0, 2, 3].map(|scalar| self.poses() + scalar).to_vec(),
         }
     }
 }

@@ -200,8 +200,7 @@ impl LiveHand {
     }
 
     fn step(&mut self) {
-        let end = (self.acting.step)(&mut self.player);
-        self.has_ended = end.is_some();
+        self.has_ended = (self.acting.step)(&mut self.player).is_some();
         add(&mut self.reward, self.player.lane.env.last.reward);
     }
 }

@@ -88,10 +88,9 @@ impl Session {
                 .iteration
                 .is_multiple_of(self.config.run.checkpoint_every);
         let is_last = finished || stop.is_some();
-        let hand_over = exchange.is_alone() || is_last || save || any(|vote| vote.improved);
         Ok(Decision {
             save: save && !is_last,
-            hand_over,
+            hand_over: exchange.is_alone() || is_last || save || any(|vote| vote.improved),
             stop,
         })
     }

@@ -145,20 +145,17 @@ impl Session {
             let Some(evaluation) = self.evaluate(due, &now, duties)? else {
                 return Ok(None);
             };
-            let histograms = self.histograms();
             let improved = self.take_down(&evaluation);
             let (ended, steps) = self.take_results();
-            let dumps = self.dumps();
-            let decision = self.decide(requests, duties.is_stopped_by_file(), improved)?;
             Ok(Some(Outcome {
                 iteration,
                 ended,
                 steps,
                 evaluation,
                 traffic,
-                histograms,
-                dumps,
-                decision,
+                histograms: self.histograms(),
+                dumps: self.dumps(),
+                decision: self.decide(requests, duties.is_stopped_by_file(), improved)?,
             }))
         };
         caught(iterate).with_context(|| format!("iteration {number}"))
@@ -189,10 +186,9 @@ impl Session {
 
     /// The histograms that are due after this iteration. Only the first rank has some.
     fn histograms(&self) -> Vec<(&'static str, Histogram)> {
-        let due =
-            self.agent.exchange.is_first() && self.agent.iteration.is_multiple_of(HISTOGRAMS_EVERY);
-        if due {
-            histograms(&self.agent.rollout)
+        let agent = &self.agent;
+        if agent.exchange.is_first() && agent.iteration.is_multiple_of(HISTOGRAMS_EVERY) {
+            histograms(&agent.rollout)
         } else {
             Vec::new()
         }

@@ -359,9 +359,8 @@ fn expect_scene(parent: &Config, config: &Config, checkpoint: &Checkpoint) -> Re
     before.hand.clone_from(&config.hand);
     let task =
         Task::new(&before).context("a fork keeps the scene and the hand of its checkpoint")?;
-    let here = task.scene.fingerprint();
     ensure!(
-        checkpoint.scene == here,
+        checkpoint.scene == task.scene.fingerprint(),
         "{MODEL} = {}: not the scene of the checkpoint, which a fork must keep",
         config.env.model
     );
