@@ -100,8 +100,8 @@ pub fn plot(args: &PlotArgs) -> Result<()> {
 /// The name of the metric that is drawn: the other one if only that has values.
 fn known_name<'a>((usual, other): Metric<'a>, runs: &[RunTable]) -> &'a str {
     let is_known = |name: &str| {
-        let columns = runs.iter().filter_map(|run| run.table.columns.get(name));
-        columns.flatten().any(|x| !x.is_nan())
+        let mut values = runs.iter().flat_map(|run| run.table.column(name));
+        values.any(|x| !x.is_nan())
     };
     other
         .filter(|other| !is_known(usual) && is_known(other))
@@ -155,8 +155,8 @@ fn runs(args: &PlotArgs, wanted: &[&str]) -> Result<Vec<RunTable>> {
 /// The control steps that are averaged into a point. They are as many for all runs, so that a table with fewer rows, as in docs/curves,
 /// is not smoothed more.
 fn window(runs: &[RunTable], smooth: Option<usize>) -> f64 {
-    let steps = || runs.iter().map(|run| &run.table.columns[ALONG[0]]);
-    let shortest = steps().map(Vec::len).min().unwrap_or(0);
+    let steps = || runs.iter().map(|run| run.table.column(ALONG[0]));
+    let shortest = steps().map(<[f64]>::len).min().unwrap_or(0);
     let rows = smooth.unwrap_or((shortest / 10).clamp(1, SMOOTH));
     let in_row = steps().filter_map(|steps| Some(steps.get(1)? - steps[0]));
     rows as f64 * in_row.fold(f64::INFINITY, f64::min)
@@ -199,11 +199,11 @@ impl RunTable {
         };
         let table = run::read_metrics(place, required, wanted)?;
 
-        let steps = &table.columns[ALONG[0]];
+        let [steps, collect_s, update_s] = ALONG.map(|name| table.column(name));
         ensure!(!steps.is_empty(), "{}: no rows yet", place.display());
         let along = match along {
             Along::Steps => steps.iter().map(|steps| steps / 1e6).collect(),
-            Along::Hours => hours(&table.columns[ALONG[1]], &table.columns[ALONG[2]]),
+            Along::Hours => hours(collect_s, update_s),
         };
         Ok(Self {
             name: name_of(place),
@@ -214,14 +214,15 @@ impl RunTable {
     /// The curve of a metric, without points if the run has no such column. Each evaluation counts by itself, at the step at which it
     /// was made. Other values are averaged over windows of so many steps.
     fn curve(&self, name: &str, window: f64) -> Curve {
-        let Some(values) = self.table.columns.get(name) else {
+        let values = self.table.column(name);
+        if values.is_empty() {
             return Curve::default();
-        };
+        }
         let dots = name.starts_with(EVALUATION);
         let lengths = if dots {
             vec![1; values.len()]
         } else {
-            lengths_of_windows(&self.table.columns[ALONG[0]], window)
+            lengths_of_windows(self.table.column(ALONG[0]), window)
         };
         Curve {
             points: smooth(&self.along, values, &lengths),

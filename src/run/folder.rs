@@ -144,9 +144,8 @@ impl RunFolder {
             .unwrap_or_default();
         let above = there.ancestors().skip(usize::from(whole.exists()));
         for folder in above.map(|path| Self::at(path.to_owned())) {
-            let holds_a_run = folder.checkpoints.begun() || folder.path().join(LOCK).exists();
             ensure!(
-                !holds_a_run,
+                !folder.holds_a_run(),
                 "{} lies inside the run {}",
                 self.place().display(),
                 folder.path().display()
@@ -155,13 +154,20 @@ impl RunFolder {
         Ok(())
     }
 
+    /// Whether a run has saved anything here, or was locked here.
+    pub(super) fn holds_a_run(&self) -> bool {
+        self.checkpoints.begun() || self.path().join(LOCK).exists()
+    }
+
     /// Creates a run folder among the temporary files, for a run whose own folder cannot be written to.
     ///
     /// # Errors
     /// Fails if the folder cannot be created.
     pub fn for_now() -> Result<Self> {
-        let folder = tempfile::Builder::new().prefix("shadow-repose-").tempdir();
-        let folder = folder.cannot("create a folder in", &std::env::temp_dir())?;
+        let folder = tempfile::Builder::new()
+            .prefix("shadow-repose-")
+            .tempdir()
+            .cannot("create a folder in", &std::env::temp_dir())?;
         let mut run = Self::at(folder.keep());
         run.checkpoints.hold()?;
         Ok(run)

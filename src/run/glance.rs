@@ -35,8 +35,7 @@ impl Glance {
                 .ok()
                 .filter(Metadata::is_file)
         };
-        let written =
-            |facts: &Option<Metadata>| facts.as_ref().and_then(|facts| facts.modified().ok());
+        let written = |facts: &Option<Metadata>| facts.as_ref()?.modified().ok();
         let [config, metrics, lock, mark] = [CONFIG, METRICS, LOCK, FINISHED].map(facts);
         if config.is_none() && metrics.is_none() && lock.is_none() {
             return None;

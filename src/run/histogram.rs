@@ -26,11 +26,8 @@ pub fn histogram<'a>(values: impl Iterator<Item = &'a f32> + Clone) -> Histogram
         ..Histogram::default()
     };
     for x in values {
-        let bin = if width > 0.0 {
-            ((x - min) / width) as usize
-        } else {
-            0
-        };
+        // Without a width, it is NaN, which becomes 0.
+        let bin = ((x - min) / width) as usize;
         found.bucket[bin.min(bins - 1)] += 1.0;
         found.num += 1.0;
         found.sum += x;

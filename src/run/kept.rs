@@ -6,7 +6,7 @@ use anyhow::{Result, bail, ensure};
 
 use super::checkpoints::CHECKPOINTS;
 use super::folder::{DIVERGED, FINISHED, OURS, RunFolder, is_one_of};
-use crate::os::{LOCK, final_path, same_file};
+use crate::os::{final_path, same_file};
 use crate::sim::scene_files;
 
 /// The names of the files in the folders of the checkpoints and of the dumps of a run. A star stands for anything.
@@ -49,14 +49,14 @@ pub fn expect_output<'a>(
     let inside = folder.ends_with(CHECKPOINTS) || folder.ends_with(DIVERGED);
     let place = folder.parent().filter(|_| inside).unwrap_or(folder);
     let run = RunFolder::at(place.to_owned());
-    let is_run = run.checkpoints.begun() || run.path().join(LOCK).exists();
+
     let is_kept = if inside {
         is_one_of(name, &INSIDE)
     } else {
         name == FINISHED || is_one_of(name, &OURS)
     };
     ensure!(
-        !is_run || !is_kept,
+        !run.holds_a_run() || !is_kept,
         "{}: the run {} reserves this file name; choose another name",
         path.display(),
         place.display()

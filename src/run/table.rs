@@ -33,6 +33,13 @@ pub struct MetricsTable {
     pub columns: HashMap<String, Vec<f64>>,
 }
 
+impl MetricsTable {
+    /// The values of a column, or none if there is no such column.
+    pub fn column(&self, name: &str) -> &[f64] {
+        self.columns.get(name).map_or(&[], Vec::as_slice)
+    }
+}
+
 /// The table that `place` means: a file, or the table of a run folder.
 pub fn table_of(place: &Path) -> PathBuf {
     if place.is_dir() {

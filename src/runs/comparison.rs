@@ -122,13 +122,10 @@ fn curves(run: &Run) -> Result<Curves> {
     let columns = COMPARED.map(|(group, column)| format!("{group}/{column}"));
     let wanted = columns.each_ref().map(String::as_str);
     let table = read_metrics(&run.path, &["env_steps"], &wanted).context("cannot compare")?;
-    let steps = &table.columns["env_steps"];
+    let steps = table.column("env_steps").iter();
     Ok(columns.map(|column| {
-        let values = table.columns.get(&column).map_or(&[][..], |values| values);
-        let points = steps
-            .iter()
-            .zip(values)
-            .map(|(step, value)| [*step, *value]);
+        let values = steps.clone().zip(table.column(&column));
+        let points = values.map(|(step, value)| [*step, *value]);
         points
             .filter(|[step, value]| !step.is_nan() && !value.is_nan())
             .collect()

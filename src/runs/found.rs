@@ -65,7 +65,7 @@ impl Run {
         path: &Path,
         glance: &Glance,
         default: &Config,
-        known: Option<&&Figures>,
+        known: Option<&Figures>,
         now: SystemTime,
     ) -> Self {
         let read = |path: &PathBuf| Source::new(path, os::read_text(path)?).resolve();
@@ -77,7 +77,7 @@ impl Run {
         });
         let stamp = glance.metrics.as_deref().and_then(os::stamp);
         let figures = match known.filter(|known| known.stamp == stamp) {
-            Some(known) => (*known).clone(),
+            Some(known) => known.clone(),
             None => Figures::of(path, stamp),
         };
         problems.extend(figures.problem.clone());
@@ -204,8 +204,7 @@ impl Figures {
         let read = || -> Result<Self> {
             let names = ["env_steps", "time/steps_per_s", "eval/goals"];
             let table = read_metrics(run, &names[..1], &names[1..])?;
-            let [steps, speeds, goals] =
-                names.map(|name| table.columns.get(name).map_or(&[][..], |values| values));
+            let [steps, speeds, goals] = names.map(|name| table.column(name));
             let known = |values: &[f64]| {
                 let values = values.iter().copied();
                 Vec::from_iter(values.filter(|value| !value.is_nan()))

@@ -3,8 +3,7 @@
 mod comparison;
 mod found;
 
-use std::collections::HashMap;
-use std::path::Path;
+use std::path::PathBuf;
 use std::thread;
 use std::time::{Duration, SystemTime};
 
@@ -17,7 +16,7 @@ use crate::config::Config;
 use crate::os::{self, Screen, aligned, text_of};
 use crate::run::{self, Glance};
 use comparison::Comparison;
-use found::{Figures, Run};
+use found::Run;
 
 /// The time between two tables of `--watch`.
 const EVERY: Duration = Duration::from_secs(5);
@@ -98,15 +97,12 @@ fn read(args: &RunsArgs, default: &Config, before: &[Run]) -> Result<Vec<Run>> {
     if places.len() < 2 {
         found.sort_by(|(a, of_a), (b, of_b)| (of_b.begun, b).cmp(&(of_a.begun, a)));
     }
-    let known: HashMap<&Path, &Figures> = before
-        .iter()
-        .map(|run| (&*run.path, &run.figures))
-        .collect();
     let now = SystemTime::now();
-    Ok(found
-        .into_par_iter()
-        .map(|(path, glance)| Run::of(&path, &glance, default, known.get(&*path), now))
-        .collect())
+    let of = |(path, glance): (PathBuf, Glance)| {
+        let known = before.iter().find(|run| run.path == path);
+        Run::of(&path, &glance, default, known.map(|run| &run.figures), now)
+    };
+    Ok(found.into_par_iter().map(of).collect())
 }
 
 /// The runs as lines. Two that are compared have letters.

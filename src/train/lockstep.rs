@@ -6,7 +6,7 @@ use anyhow::{Result, bail};
 use serde::{Deserialize, Serialize};
 
 use super::session::Session;
-use crate::env::Member;
+
 use crate::os::Requests;
 
 /// Why a run ends before all its steps are made.
@@ -102,10 +102,11 @@ impl Session {
         }
         let iteration = self.agent.iteration;
         let mut own = Vec::new();
-        for Member { env, number, .. } in self.agent.pool.members_mut() {
-            if let Some(diverged) = env.diverged.take() {
-                let text = diverged.as_json(&self.config.env, iteration, *number);
-                own.push((format!("iteration-{iteration:08}-env-{number}.json"), text));
+        for member in self.agent.pool.members_mut() {
+            if let Some(diverged) = member.env.diverged.take() {
+                let text = diverged.as_json(&self.config.env, iteration, member.number);
+                let name = format!("iteration-{iteration:08}-env-{}.json", member.number);
+                own.push((name, text));
             }
         }
         self.agent.exchange.all_gather(own).concat()

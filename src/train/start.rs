@@ -130,7 +130,13 @@ impl Plan {
         let context = format!("cannot resume from {}", path.display());
         let config = load::settings(&checkpoint, &path, Reader::Run, &overrides(args))
             .context(context.clone())?;
-        expect_same(&load::source(&checkpoint, &path).resolve()?, &config)?;
+        let stored = load::source(&checkpoint, &path).resolve()?;
+        let differing = stored.differences(&config);
+        ensure!(
+            differing.is_empty(),
+            "{}: a resumed run accepts only {MODEL}, --total-steps and --threads; use --fork for other settings",
+            differing.join("; ")
+        );
         expect_states(&checkpoint, &config).context(context.clone())?;
         expect_config(&folder, &config)?;
         // The best evaluation comes from the folder. It may have been saved after the checkpoint that is resumed, and a worse
@@ -289,17 +295,6 @@ fn overrides(args: &TrainArgs) -> Vec<Override> {
         })
     });
     args.settings.set.iter().cloned().chain(given).collect()
-}
-
-/// Checks that a resumed run has the settings that are `stored` in its checkpoint.
-fn expect_same(stored: &Config, config: &Config) -> Result<()> {
-    let differing = stored.differences(config);
-    ensure!(
-        differing.is_empty(),
-        "{}: a resumed run accepts only {MODEL}, --total-steps and --threads; use --fork for other settings",
-        differing.join("; ")
-    );
-    Ok(())
 }
 
 /// Checks that the settings in the folder match the checkpoint, because edits to them would be ignored.

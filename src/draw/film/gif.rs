@@ -1,6 +1,5 @@
 //! GIF: one palette for the whole film. Each frame holds only what differs from the previous one.
 
-use std::borrow::Cow;
 use std::io::{BufWriter, Write};
 
 use anyhow::Result;
@@ -80,7 +79,7 @@ fn changes(palette: &mut Palette, width: usize, previous: &[u8], rgb: &[u8]) -> 
         left: left as u16,
         width: (right + 1 - left) as u16,
         height: (bottom + 1 - top) as u16,
-        buffer: Cow::Owned(pixels),
+        buffer: pixels.into(),
         ..Frame::default()
     }
 }
