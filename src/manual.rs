@@ -36,12 +36,10 @@ pub fn completions(shell: Shell) -> Result<()> {
 
 /// What clap_complete 4.6 leaves out for fish: the values of arguments without an option, and the commands after `help`.
 fn after_commands(program: &clap::Command) -> String {
-    let names = |command: &clap::Command| {
-        command
-            .get_subcommands()
-            .map(|of| of.get_name().to_owned())
-            .collect()
-    };
+    let names = program
+        .get_subcommands()
+        .map(|command| command.get_name().to_owned())
+        .collect();
     let values = |command: &clap::Command| -> Vec<String> {
         command
             .get_positionals()
@@ -59,7 +57,7 @@ fn after_commands(program: &clap::Command) -> String {
         )
     };
     commands
-        .chain([("help", names(program))])
+        .chain([("help", names)])
         .filter(|(_, words)| !words.is_empty())
         .map(line)
         .collect()

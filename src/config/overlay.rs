@@ -52,30 +52,21 @@ pub fn is_ramp(table: &Table) -> bool {
 /// for a string key. Numbers may lack the zero before their point, which TOML requires.
 pub fn table_of(key: &str, text: &str, merged: &Table) -> Table {
     let parse = |text: &str| {
-        format!("value = {text}")
-            .parse::<Table>()
-            .ok()
-            .filter(|t| t.len() == 1)
+        let mut table: Table = format!("value = {text}").parse().ok()?;
+        table.remove("value").filter(|_| table.is_empty())
     };
-    let parsed = parse(text)
-        .or_else(|| parse(&with_zeros(text)))
-        .and_then(|mut t| t.remove("value"));
     let wants_text = lookup(&DEFAULTS, key).is_some_and(Value::is_str);
-    let mut value = match parsed {
+    let mut value = match parse(text).or_else(|| parse(&with_zeros(text))) {
         Some(value) if !wants_text || value.is_str() => value,
-        _ => Value::String(text.to_owned()),
+        _ => text.into(),
     };
     // The deepest level is a part of a ramp in a section. Anything deeper belongs to an unknown name.
     let parts: Vec<&str> = key.splitn(3, '.').collect();
     for depth in (1..parts.len()).rev() {
         let whole = parts[..depth].join(".");
         // `env.noise.joint_pos` changes one value of `env.noise`, so the other values are copied.
-        let by_group = lookup(&DEFAULTS, &whole)
-            .and_then(Value::as_table)
-            .is_some_and(Table::is_empty);
-        let others = lookup(merged, &whole)
-            .and_then(Value::as_table)
-            .filter(|_| by_group);
+        let inside = |of| lookup(of, &whole).and_then(Value::as_table);
+        let others = inside(merged).filter(|_| inside(&DEFAULTS).is_some_and(Table::is_empty));
         let mut table = others.cloned().unwrap_or_default();
         table.insert(parts[depth].to_owned(), value);
         value = table.into();

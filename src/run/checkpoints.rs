@@ -107,8 +107,7 @@ impl Checkpoints {
             .into_iter()
             .flatten()
             .flatten();
-        let files = entries.filter(|entry| entry.file_type().is_ok_and(|kind| kind.is_file()));
-        let numbered = files.filter_map(|entry| {
+        let numbered = entries.filter_map(|entry| {
             let name = entry.file_name();
             let number = name
                 .to_str()?
@@ -116,7 +115,8 @@ impl Checkpoints {
                 .strip_suffix(".safetensors")?
                 .parse()
                 .ok()?;
-            Some((number, entry.path()))
+            let is_file = entry.file_type().is_ok_and(|kind| kind.is_file());
+            is_file.then(|| (number, entry.path()))
         });
         let mut numbered: Vec<_> = numbered.collect();
         numbered.sort_unstable_by(|a, b| b.cmp(a));

@@ -224,9 +224,8 @@ impl Report {
 
     /// Says in the row of TensorBoard's HPARAMS that the run has made all its steps, or has failed.
     pub fn end(&mut self, succeeded: bool) {
-        let step = self.env_steps;
         self.session.write(&self.progress, |events| {
-            events.values(hparams::end(succeeded)?, step)
+            events.values(hparams::end(succeeded)?, self.env_steps)
         });
     }
 

@@ -235,16 +235,14 @@ impl RunState {
         now: SystemTime,
     ) -> Self {
         let all = env_steps.zip(total_steps).map(|(made, all)| made >= all);
-        let age = glance
-            .logged
-            .map(|logged| now.duration_since(logged).unwrap_or_default());
+        let is_silent = |logged| now.duration_since(logged).unwrap_or_default() >= SILENT;
         // One that could not save its end has neither the mark nor released its lock.
         let has_ended = glance.is_marked || glance.hold == Hold::Released;
         match glance.hold {
             Hold::Held => Self::Training,
             _ if has_ended && all.unwrap_or(glance.is_marked) => Self::Finished,
             _ if glance.is_marked => Self::Stopped,
-            Hold::Elsewhere if age.is_some_and(|age| age < SILENT) => Self::Training,
+            Hold::Elsewhere if !glance.logged.is_none_or(is_silent) => Self::Training,
             Hold::Released => Self::Stopped,
             Hold::Left | Hold::Elsewhere => Self::Failed,
         }
