@@ -3,7 +3,7 @@
 
 use std::collections::{BTreeSet, HashSet};
 use std::iter;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use anyhow::{Result, bail, ensure};
 
@@ -51,8 +51,8 @@ struct RunTable {
 /// Fails if no run has readable metrics with at least one row, if none has a requested column, or if the picture cannot be written.
 pub fn plot(args: &PlotArgs) -> Result<()> {
     // Opened before anything is read, so that a path that cannot be written to is reported at once.
-    let tables: Vec<PathBuf> = args.runs.iter().map(|place| run::table_of(place)).collect();
-    run::expect_output(&args.out.path, tables.iter().map(PathBuf::as_path), None)?;
+    let tables = args.runs.iter().map(|place| run::table_of(place));
+    run::expect_output(&args.out.path, tables, None)?;
     let output = PictureFile::create(&args.out)?;
     let mut metrics: Vec<Metric> = args.metric.iter().map(|name| (&name[..], None)).collect();
     if metrics.is_empty() {

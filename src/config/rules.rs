@@ -141,16 +141,11 @@ fn env(config: &Config, rules: &mut Rules) {
     let near = place.iter().all(|x| x.abs() <= FARTHEST);
     let rule = format!("have coordinates of at most {FARTHEST} m");
     rules.check(near, "env.goal_position", format!("{place:?}"), rule);
-    let names = |path: &str| path.split('/').all(|name| name.len() <= LONGEST_NAME);
-    let is_path = |path: &str| {
-        (1..=LONGEST_PATH).contains(&path.len()) && names(path) && !path.contains(char::is_control)
-    };
-    rules.check(
-        is_path(&env.model),
-        "env.model",
-        &env.model,
-        "be a path or \"builtin\"",
-    );
+    let model = &env.model;
+    let is_path = (1..=LONGEST_PATH).contains(&model.len())
+        && model.split('/').all(|name| name.len() <= LONGEST_NAME)
+        && !model.contains(char::is_control);
+    rules.check(is_path, "env.model", model, "be a path or \"builtin\"");
     let ratio = env.ctrl_dt / env.sim_dt;
     let whole = (1.0..=1e4).contains(&ratio.round()) && (ratio / ratio.round() - 1.0).abs() < 1e-6;
     rules.check(
@@ -173,7 +168,7 @@ fn env(config: &Config, rules: &mut Rules) {
 
 fn randomization(config: &Config, table: &Table, rules: &mut Rules) {
     let env = &config.env;
-    let drawn = &config.randomization;
+
     // A factor that is drawn from a range also has a setting in [env].
     for (key, value) in table["randomization"].as_table().into_iter().flatten() {
         let Some([Value::Float(low), Value::Float(high)]) = value.as_array().map(Vec::as_slice)
@@ -191,7 +186,7 @@ fn randomization(config: &Config, table: &Table, rules: &mut Rules) {
         let factor = table["env"][&scale].as_float().expect("a factor");
         rules.check(factor > 0.0, &format!("env.{scale}"), factor, "be above 0");
     }
-    let [low, high] = drawn.delay;
+    let [low, high] = config.randomization.delay;
     let range = format!("[{low}, {high}]");
     rules.check(
         low <= high,
@@ -261,9 +256,7 @@ fn nets(config: &Config, rules: &mut Rules) {
 fn samples(config: &Config, rules: &mut Rules) {
     let ppo = &config.ppo;
     let horizon = ppo.horizon;
-    let whole = [horizon.from, horizon.to]
-        .iter()
-        .all(|steps| steps.fract() == 0.0);
+    let whole = horizon.from.fract() == 0.0;
     let multiple = horizon.from < 1.0 || whole && horizon.to % horizon.from == 0.0;
     rules.check(
         multiple,

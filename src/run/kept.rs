@@ -1,6 +1,6 @@
 //! Which files an output may not replace.
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use anyhow::{Result, bail, ensure};
 
@@ -25,15 +25,15 @@ const INSIDE: [&str; 7] = [
 ///
 /// # Errors
 /// Fails if it does, even through links, or as [`scene_files`] does.
-pub fn expect_output<'a>(
+pub fn expect_output(
     path: &Path,
-    read: impl IntoIterator<Item = &'a Path>,
+    read: impl IntoIterator<Item: AsRef<Path>>,
     scene: Option<&Path>,
 ) -> Result<()> {
     let of_scene = scene.map(scene_files).transpose()?;
     let mut read = read
         .into_iter()
-        .map(PathBuf::from)
+        .map(|read| read.as_ref().to_owned())
         .chain(of_scene.unwrap_or_default());
     if let Some(read) = read.find(|read| same_file(path, read)) {
         bail!(

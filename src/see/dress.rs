@@ -1,7 +1,5 @@
 //! The meshes of the real Shadow Hand, which are shown over the primitives of the built-in scene.
 
-use std::collections::BTreeSet;
-
 use crate::sim::{Dress, Piece};
 
 /// A part of the hand: the end of its body's name, mesh file, material in the built-in scene, height above the body's origin in m.
@@ -36,22 +34,27 @@ const FINGER: [MeshPart; 4] = [
 
 /// The mesh files of the hand, sorted and without duplicates.
 pub fn mesh_files() -> Vec<&'static str> {
-    let parts = PARTS.iter().flat_map(|(_, parts)| *parts);
-    let files: BTreeSet<_> = parts.map(|part| part.1).collect();
-    files.into_iter().collect()
+    let mut files: Vec<&str> = PARTS
+        .iter()
+        .flat_map(|(_, parts)| parts.iter().map(|part| part.1))
+        .collect();
+    files.sort_unstable();
+    files.dedup();
+    files
 }
 
 /// The meshes on a hand whose names have this prefix, given the contents of [`mesh_files`] in that order.
 pub fn dress(prefix: &str, contents: Vec<Vec<u8>>) -> Dress {
     let pieces = PARTS.iter().flat_map(|(finger, parts)| {
-        parts
-            .iter()
-            .map(move |&(part, file, material, height)| Piece {
-                body: format!("{prefix}{finger}{part}"),
+        parts.iter().map(move |&(part, file, material, height)| {
+            let body = format!("{prefix}{finger}{part}");
+            Piece {
+                body,
                 file,
                 material,
                 height,
-            })
+            }
+        })
     });
     Dress {
         bodies: prefix.to_owned(),

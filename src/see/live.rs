@@ -207,7 +207,7 @@ impl LiveHand {
 
 /// The first event for a viewer: the key of the page, and what is under way.
 fn hello(key: &str, hands: &[LiveHand], sliders: Option<&Sliders>) -> String {
-    let episodes: Vec<&Value> = hands.iter().map(|hand| &hand.about).collect();
+    let episodes: Value = hands.iter().map(|hand| hand.about.clone()).collect();
     let mut hello = json!({ "key": key, "episodes": episodes });
     if let Some(sliders) = sliders {
         hello["controls"] = sliders.values();

@@ -124,15 +124,9 @@ impl Tally {
     }
 
     fn summary(&self) -> String {
-        let Self {
-            steps,
-            completed,
-            drops,
-            goals,
-            ..
-        } = self;
         format!(
-            "shown: {steps} steps, {completed} episodes completed, {drops} drops, {goals} goals reached"
+            "shown: {} steps, {} episodes completed, {} drops, {} goals reached",
+            self.steps, self.completed, self.drops, self.goals
         )
     }
 }

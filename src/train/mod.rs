@@ -225,12 +225,15 @@ impl Session {
     fn take_down(&mut self, evaluation: &Score) -> bool {
         let found = [evaluation["goals"], evaluation["rot_dist"]];
         let improved = beats(found, self.best);
-        self.best = if improved { Some(found) } else { self.best };
+        if improved {
+            self.best = Some(found);
+        }
         // While the critic learns alone, an evaluation cannot rise.
-        if evaluation.episodes > 0 && !self.agent.ppo.is_critic_alone(self.agent.iteration) {
-            self.rise
-                .iter_mut()
-                .for_each(|rise| rise.add(figures(evaluation)));
+        if evaluation.episodes > 0
+            && !self.agent.ppo.is_critic_alone(self.agent.iteration)
+            && let Some(rise) = &mut self.rise
+        {
+            rise.add(figures(evaluation));
         }
         improved
     }
@@ -268,9 +271,9 @@ impl Session {
             Ok(())
         })?;
         let score = played.map(|played| Score::of(&played, ctrl_dt));
-        score
-            .iter()
-            .for_each(|score| duties.evaluated(self.agent.env_steps, score));
+        if let Some(score) = &score {
+            duties.evaluated(self.agent.env_steps, score);
+        }
         Ok(score)
     }
 }

@@ -179,11 +179,7 @@ impl Plan {
         let mut plan = Self::new(config, args)?;
         let config = &plan.config;
         expect_scene(&parent, config, &checkpoint)?;
-        let from = path
-            .canonicalize()
-            .unwrap_or_else(|_| path.to_owned())
-            .display()
-            .to_string();
+        let whole = path.canonicalize();
         let progress = &mut checkpoint.progress;
         ensure!(
             progress.env_steps < config.run.total_steps,
@@ -192,7 +188,7 @@ impl Plan {
             progress.env_steps
         );
         progress.fork = Some(Fork {
-            from,
+            from: whole.as_deref().unwrap_or(path).display().to_string(),
             iteration: progress.iteration,
             env_steps: progress.env_steps,
         });
