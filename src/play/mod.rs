@@ -60,11 +60,10 @@ pub fn play(args: &PlayArgs, requests: &Requests) -> Result<ExitCode> {
             let load = |changes: &[Override]| {
                 task(stage.policy.as_ref(), &[&args.set[..], changes].concat())
             };
-            let actor = stage.actor();
             robustness(
                 &load,
-                &actor,
-                &stage.origin().unwrap_or(actor.name().to_owned()),
+                &stage.actor(),
+                &stage.place(),
                 episodes(args, 256),
                 &report,
                 requests,

@@ -102,6 +102,11 @@ impl Stage {
         self.policy.as_ref().map(|policy| policy.origin.to_string())
     }
 
+    /// Where the policy comes from, or the name of the actor.
+    pub fn place(&self) -> String {
+        self.origin().unwrap_or(self.actor().name().to_owned())
+    }
+
     /// What a page says of the policy: its description, and where it does not fit well.
     pub fn described(&self) -> Option<String> {
         let warnings = self.task.warnings.iter().map(String::as_str);

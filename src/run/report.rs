@@ -95,11 +95,10 @@ impl<W> Log<W> {
 
     /// Ensures that everything is on the disk. Reports if it is not.
     fn sync(&mut self, progress: &StatusLine, sync: impl FnOnce(&mut W) -> Result<()>) {
-        let Some(result) = self.writer.as_mut().map(sync) else {
-            return;
-        };
-        let unsynced = std::mem::take(&mut self.unsynced);
-        result.unwrap_or_else(|error| self.give_up(progress, unsynced, &error));
+        if let Some(result) = self.writer.as_mut().map(sync) {
+            let unsynced = std::mem::take(&mut self.unsynced);
+            result.unwrap_or_else(|error| self.give_up(progress, unsynced, &error));
+        }
     }
 
     /// Stops writing, and counts the iterations that are `lost`. Reports this unless it is known.

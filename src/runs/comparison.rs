@@ -94,7 +94,7 @@ impl Comparison {
     }
 
     /// Its object of JSON, with these objects of both runs.
-    pub fn as_json(&self, runs: &[Value]) -> Value {
+    pub fn as_json(&self, runs: Value) -> Value {
         let settings = self.settings.as_ref().map(|all| {
             let all = all.iter().map(|(key, both)| (key.clone(), json!(both)));
             Value::from_iter(all)

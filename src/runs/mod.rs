@@ -9,7 +9,7 @@ use std::time::{Duration, SystemTime};
 
 use anyhow::{Result, ensure};
 use rayon::prelude::*;
-use serde_json::{Value, json};
+use serde_json::Value;
 
 use crate::cli::RunsArgs;
 use crate::config::Config;
@@ -50,9 +50,12 @@ pub fn runs(args: &RunsArgs) -> Result<()> {
             _ => None,
         };
         if args.json {
-            let all: Vec<Value> = runs.iter().map(Run::as_json).collect();
-            let text = compared.map_or_else(|| json!(all), |compared| compared.as_json(&all));
-            return os::print(&(os::harmless(&text.to_string()) + "\n"));
+            let all: Value = runs.iter().map(Run::as_json).collect();
+            let shown = match compared {
+                Some(compared) => compared.as_json(all),
+                None => all,
+            };
+            return os::print(&(os::harmless(&shown.to_string()) + "\n"));
         }
         if runs.is_empty() && !args.watch {
             os::say!("there are no runs in this folder");

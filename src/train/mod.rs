@@ -68,16 +68,15 @@ fn lead(args: &TrainArgs, requests: &Requests, exchange: &Exchange) -> Result<Ex
     session.task.say_warnings();
     if !args.quiet {
         let default = Config::default();
-        let hints = hints(&session.config, args, &default, session.task.scene.size());
-        let own_scene = session.config.env.model_file().is_some() && args.resume.is_none();
-        let mobility = own_scene.then(|| mobility(&session.task, &default.env));
-        session
-            .task
-            .notes()
-            .iter()
-            .chain(&mobility)
-            .chain(&hints)
-            .for_each(|hint| say!("note: {hint}"));
+        let mut notes = session.task.notes();
+        if session.config.env.model_file().is_some() && args.resume.is_none() {
+            notes.push(mobility(&session.task, &default.env));
+        }
+        let size = session.task.scene.size();
+        notes.extend(hints(&session.config, args, &default, size));
+        for note in notes {
+            say!("note: {note}");
+        }
     }
     let mut lead = Lead::new(&session, saver, args.quiet);
     if args.resume.is_none() {
