@@ -13,25 +13,19 @@ const PROGRAM: &str = "shadow-repose";
 /// # Errors
 /// Fails if stdout cannot be written to.
 pub fn completions(shell: Shell) -> Result<()> {
+    // For a name with a hyphen, clap_complete 4.6 gives each command two names in a script for bash, and completes nothing after a
+    // command.
+    let is_bash = shell == Shell::Bash;
+    let name = if is_bash { "shadow_repose" } else { PROGRAM };
+    let mut program = command().name(name);
     let mut text = Vec::new();
-    let mut program = command();
-    if shell != Shell::Bash {
-        clap_complete::generate(shell, &mut program, PROGRAM, &mut text);
-        let mut text = String::from_utf8(text)?;
-        if shell == Shell::Fish {
-            text += &after_commands(&program);
-        }
-        return os::print(&text);
-    }
-    // For a name with a hyphen, clap_complete 4.6 gives each command two names in the script, and completes nothing after a command.
-    clap_complete::generate(
-        shell,
-        &mut program.name("shadow_repose"),
-        "shadow_repose",
-        &mut text,
-    );
-    let text = String::from_utf8(text)?.replace(" shadow_repose\n", &format!(" {PROGRAM}\n"));
-    os::print(&text)
+    clap_complete::generate(shell, &mut program, name, &mut text);
+    let text = String::from_utf8(text)?;
+    os::print(&match shell {
+        Shell::Bash => text.replace(" shadow_repose\n", &format!(" {PROGRAM}\n")),
+        Shell::Fish => text + &after_commands(&program),
+        _ => text,
+    })
 }
 
 /// What clap_complete 4.6 leaves out for fish: the values of arguments without an option, and the commands after `help`.

@@ -119,15 +119,14 @@ fn panel(name: &str, runs: &[RunTable], window: f64, seeds: bool) -> Subplot {
         }
         curves = vec![mean_and_band(&curves)];
     }
-    let nothing = if name.starts_with(EVALUATION) {
-        "no evaluation yet"
-    } else {
-        "nothing yet"
-    };
     Subplot {
         title,
         curves,
-        nothing,
+        nothing: if name.starts_with(EVALUATION) {
+            "no evaluation yet"
+        } else {
+            "nothing yet"
+        },
     }
 }
 

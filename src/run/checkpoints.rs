@@ -60,9 +60,10 @@ impl Checkpoints {
         for (_, path) in earlier.iter().skip(keep) {
             nicety(fs::remove_file(path));
         }
-        later
-            .iter()
-            .try_for_each(|(_, path)| put_aside(path, "later").map(drop).cannot("rename", path))
+        for (_, path) in later {
+            put_aside(&path, "later").cannot("rename", &path)?;
+        }
+        Ok(())
     }
 
     /// Writes the checkpoint that scored best.

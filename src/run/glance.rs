@@ -69,10 +69,9 @@ pub fn folders_of_runs(folder: Option<&Path>, waits: bool) -> Result<Vec<PathBuf
         );
     }
     let entries = fs::read_dir(path).cannot("read the folder", path)?;
-    let is_folder = |entry: &fs::DirEntry| entry.file_type().is_ok_and(|kind| kind.is_dir());
     Ok(entries
         .flatten()
-        .filter(is_folder)
+        .filter(|entry| entry.file_type().is_ok_and(|kind| kind.is_dir()))
         .map(|entry| entry.path())
         .collect())
 }

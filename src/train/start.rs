@@ -45,6 +45,14 @@ pub enum Takes {
     Fork,
 }
 
+/// The settings that a fork keeps: they determine the size of the state or the kind of policy.
+const KEPT: [&str; 4] = [
+    "env.num_envs",
+    "ppo.hidden",
+    "ppo.symmetry",
+    "ppo.activation",
+];
+
 /// The parts of a plan as they are sent: the settings as text, the checkpoint as a file.
 type PlanParts = (
     String,
@@ -175,7 +183,14 @@ impl Plan {
     fn forked(path: &Path, mut checkpoint: Checkpoint, args: &TrainArgs) -> Result<Self> {
         let (parent, config) = load::for_fork(&checkpoint, path, settings(args)?)?;
         expect_states(&checkpoint, &parent)?;
-        expect_kept(&parent, &config)?;
+        for (key, [before, now]) in parent.compared_with(&config) {
+            ensure!(
+                !KEPT.contains(&&*key),
+                "{key} = {}: a fork keeps {}, the value of its checkpoint",
+                short(&now),
+                short(&before)
+            );
+        }
         let mut plan = Self::new(config, args)?;
         let config = &plan.config;
         expect_scene(&parent, config, &checkpoint)?;
@@ -322,24 +337,6 @@ fn expect_net(checkpoint: &Checkpoint, stored: &PpoConfig, settings: &PpoConfig)
         found == expected,
         "its activation and symmetry are {found:?}, but those of this training run are {expected:?}"
     );
-    Ok(())
-}
-
-/// Checks that a fork keeps the settings that determine the size of the state or the kind of policy.
-fn expect_kept(parent: &Config, config: &Config) -> Result<()> {
-    let kept = [
-        "env.num_envs",
-        "ppo.hidden",
-        "ppo.symmetry",
-        "ppo.activation",
-    ];
-    for (key, [before, now]) in parent.compared_with(config) {
-        let [before, now] = [before, now].map(|value| short(&value));
-        ensure!(
-            !kept.contains(&&*key),
-            "{key} = {now}: a fork keeps {before}, the value of its checkpoint"
-        );
-    }
     Ok(())
 }
 
