@@ -197,7 +197,6 @@ impl RunTable {
             Along::Hours => &ALONG,
         };
         let table = run::read_metrics(place, required, wanted)?;
-
         let [steps, collect_s, update_s] = ALONG.map(|name| table.column(name));
         ensure!(!steps.is_empty(), "{}: no rows yet", place.display());
         let along = match along {

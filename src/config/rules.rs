@@ -168,14 +168,12 @@ fn env(config: &Config, rules: &mut Rules) {
 
 fn randomization(config: &Config, table: &Table, rules: &mut Rules) {
     let env = &config.env;
-
     // A factor that is drawn from a range also has a setting in [env].
     for (key, value) in table["randomization"].as_table().into_iter().flatten() {
         let Some([Value::Float(low), Value::Float(high)]) = value.as_array().map(Vec::as_slice)
         else {
             continue;
         };
-
         rules.check(
             0.0 < *low && low <= high,
             &format!("randomization.{key}"),

@@ -49,7 +49,6 @@ pub fn expect_output(
     let inside = folder.ends_with(CHECKPOINTS) || folder.ends_with(DIVERGED);
     let place = folder.parent().filter(|_| inside).unwrap_or(folder);
     let run = RunFolder::at(place.to_owned());
-
     let is_kept = if inside {
         is_one_of(name, &INSIDE)
     } else {

@@ -197,7 +197,6 @@ impl Columns {
         for (key, value) in more.as_object().into_iter().flatten() {
             meta[key] = value.clone();
         }
-
         let mut scene = self.drawing.scene.take();
         scene["start"] = json!(self.drawing.start);
         Page {

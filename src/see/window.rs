@@ -47,7 +47,6 @@ impl<'a> Window<'a> {
     pub fn play(mut self, task: &Arc<Task>, episodes: Episodes) -> Result<String> {
         let mut player = Player::new(task, episodes);
         let mut tally = Tally::default();
-
         let mut curves = [
             Trend {
                 name: "rotation error, degrees (line: tolerance)",

@@ -6,7 +6,6 @@ use anyhow::{Result, bail};
 use serde::{Deserialize, Serialize};
 
 use super::session::Session;
-
 use crate::os::Requests;
 
 /// Why a run ends before all its steps are made.
