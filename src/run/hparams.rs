@@ -23,9 +23,6 @@ use crate::os::Cannot;
 /// The name of the folder.
 pub const HPARAMS: &str = "hparams";
 
-/// The class of data of a tensor (`DataClass` in TensorBoard's summary.proto).
-const TENSOR: u32 = 2;
-
 /// Begins the row of the run in `folder` anew, at this step, with these settings by dotted key.
 ///
 /// # Errors
@@ -100,7 +97,8 @@ fn session_value(name: &str, field: u32, info: &[u8]) -> Result<Summary_Value> {
         &format!("_hparams_/{name}"),
         Content::tensor(nothing),
         HPARAMS,
-        TENSOR,
+        // A tensor (`DataClass` in TensorBoard's summary.proto).
+        2,
     );
     value.mut_metadata().mut_plugin_data().set_content(content);
     Ok(value)

@@ -17,16 +17,6 @@ pub struct Stop {
     pub signal: i32,
 }
 
-impl Stop {
-    /// The stop that these requests ask for.
-    pub fn by_signal(requests: &Requests) -> Self {
-        Self {
-            by_file: false,
-            signal: requests.signal(),
-        }
-    }
-}
-
 /// What follows an iteration.
 #[derive(Debug, Default)]
 pub struct Decision {

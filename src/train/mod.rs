@@ -103,12 +103,16 @@ fn run(
     duties: &mut dyn Duties,
     requests: &Requests,
 ) -> Result<Option<Stop>> {
+    let by_signal = || Stop {
+        by_file: false,
+        signal: requests.signal(),
+    };
     if !session.begin(requests, duties)? {
-        return Ok(Some(Stop::by_signal(requests)));
+        return Ok(Some(by_signal()));
     }
     while !session.finished() {
         let Some(outcome) = session.iterate(requests, duties)? else {
-            return Ok(Some(Stop::by_signal(requests)));
+            return Ok(Some(by_signal()));
         };
         if outcome.decision.hand_over {
             duties.keep(session.checkpoint());
