@@ -34,11 +34,9 @@ struct Goal {
 impl GoalTimes {
     /// Creates an empty `GoalTimes` for episodes with these settings.
     pub fn new(config: &EnvConfig) -> Self {
-        let hold = config.max_consecutive_successes;
-        let second = (1.0 / config.ctrl_dt).round() as u32;
         Self {
-            hold,
-            second,
+            hold: config.max_consecutive_successes,
+            second: (1.0 / config.ctrl_dt).round() as u32,
             under_way: BTreeMap::new(),
             reached: Vec::new(),
             episodes: 0,

@@ -13,57 +13,48 @@ const PROGRAM: &str = "shadow-repose";
 /// # Errors
 /// Fails if stdout cannot be written to.
 pub fn completions(shell: Shell) -> Result<()> {
+    // For a name with a hyphen, clap_complete 4.6 gives each command two names in a script for bash, and completes nothing after a
+    // command.
+    let is_bash = shell == Shell::Bash;
+    let name = if is_bash { "shadow_repose" } else { PROGRAM };
+    let mut program = command().name(name);
     let mut text = Vec::new();
-    let mut program = command();
-    if shell != Shell::Bash {
-        clap_complete::generate(shell, &mut program, PROGRAM, &mut text);
-        let more = if shell == Shell::Fish {
-            after_commands(&program)
-        } else {
-            String::new()
-        };
-        return os::print(&(String::from_utf8(text)? + &more));
-    }
-    // For a name with a hyphen, clap_complete 4.6 gives each command two names in the script, and completes nothing after a command.
-    clap_complete::generate(
-        shell,
-        &mut program.name("shadow_repose"),
-        "shadow_repose",
-        &mut text,
-    );
-    let text = String::from_utf8(text)?.replace(" shadow_repose\n", &format!(" {PROGRAM}\n"));
-    os::print(&text)
+    clap_complete::generate(shell, &mut program, name, &mut text);
+    let text = String::from_utf8(text)?;
+    os::print(&match shell {
+        Shell::Bash => text.replace(" shadow_repose\n", &format!(" {PROGRAM}\n")),
+        Shell::Fish => text + &after_commands(&program),
+        _ => text,
+    })
 }
 
 /// What clap_complete 4.6 leaves out for fish: the values of arguments without an option, and the commands after `help`.
 fn after_commands(program: &clap::Command) -> String {
-    let names = |command: &clap::Command| {
+    let names = program
+        .get_subcommands()
+        .map(|command| command.get_name().to_owned())
+        .collect();
+    let values = |command: &clap::Command| -> Vec<String> {
         command
-            .get_subcommands()
-            .map(|of| of.get_name().to_owned())
-            .collect()
-    };
-    let values = |command: &clap::Command| {
-        let values = command
             .get_positionals()
-            .flat_map(clap::Arg::get_possible_values);
-        values
+            .flat_map(clap::Arg::get_possible_values)
             .map(|value| value.get_name().to_owned())
-            .collect::<Vec<_>>()
+            .collect()
     };
     let commands = program
         .get_subcommands()
         .map(|command| (command.get_name(), values(command)));
-    let commands = commands
-        .chain([("help", names(program))])
-        .filter(|(_, words)| !words.is_empty());
-    let line = |(name, words): (&str, Vec<String>)| {
+    let line = |(name, words): (_, Vec<_>)| {
         let words = words.join(" ");
         format!(
             "complete -c {PROGRAM} -n \"__fish_shadow_repose_using_subcommand {name}\" -f -a \"{words}\"\n"
         )
     };
-    commands.map(line).collect()
+    commands
+        .chain([("help", names)])
+        .filter(|(_, words)| !words.is_empty())
+        .map(line)
+        .collect()
 }
 
 /// Prints a manual page of all commands.

@@ -1,8 +1,9 @@
 //! Learning curves: metrics of one or more runs over control steps or hours. Metrics of each iteration are smoothed.
 //! Evaluations are drawn at their own steps.
 
-use std::collections::{HashMap, HashSet};
-use std::path::{Path, PathBuf};
+use std::collections::{BTreeSet, HashSet};
+use std::iter;
+use std::path::Path;
 
 use anyhow::{Result, bail, ensure};
 
@@ -36,12 +37,11 @@ const SMOOTH: usize = 50;
 /// The most names that are suggested for one that is not known.
 const SUGGESTIONS: usize = 3;
 
-/// A run: name, place on the x axis in each row, names of all columns, and the requested columns.
+/// A run: name, place on the x axis in each row, and the requested columns.
 struct RunTable {
     name: String,
     along: Vec<f64>,
-    names: Vec<String>,
-    columns: HashMap<String, Vec<f64>>,
+    table: MetricsTable,
 }
 
 /// Draws the curves. Of several runs, a run that cannot be drawn is skipped with a warning, e.g. one that was stopped in its
@@ -51,18 +51,16 @@ struct RunTable {
 /// Fails if no run has readable metrics with at least one row, if none has a requested column, or if the picture cannot be written.
 pub fn plot(args: &PlotArgs) -> Result<()> {
     // Opened before anything is read, so that a path that cannot be written to is reported at once.
-    let tables: Vec<PathBuf> = args.runs.iter().map(|place| run::table_of(place)).collect();
-    run::expect_output(&args.out.path, tables.iter().map(PathBuf::as_path), None)?;
+    let tables = args.runs.iter().map(|place| run::table_of(place));
+    run::expect_output(&args.out.path, tables, None)?;
     let output = PictureFile::create(&args.out)?;
-    let asked = args.metric.iter().map(|name| (&name[..], None));
-    let metrics: Vec<Metric> = if args.metric.is_empty() {
-        DEFAULT.to_vec()
-    } else {
-        asked.collect()
-    };
+    let mut metrics: Vec<Metric> = args.metric.iter().map(|name| (&name[..], None)).collect();
+    if metrics.is_empty() {
+        metrics.extend(DEFAULT);
+    }
     let wanted: Vec<&str> = metrics
         .iter()
-        .flat_map(|(usual, other)| [*usual].into_iter().chain(*other))
+        .flat_map(|(usual, other)| iter::chain([*usual], *other))
         .collect();
     let runs = runs(args, &wanted)?;
     expect_columns(&runs, &args.metric)?;
@@ -89,7 +87,7 @@ pub fn plot(args: &PlotArgs) -> Result<()> {
         .collect();
     Chart {
         legend,
-        along: along.to_owned(),
+        along,
         panels,
         size: args.size,
     }
@@ -102,8 +100,8 @@ pub fn plot(args: &PlotArgs) -> Result<()> {
 /// The name of the metric that is drawn: the other one if only that has values.
 fn known_name<'a>((usual, other): Metric<'a>, runs: &[RunTable]) -> &'a str {
     let is_known = |name: &str| {
-        let mut columns = runs.iter().filter_map(|run| run.columns.get(name));
-        columns.any(|values| values.iter().any(|x| !x.is_nan()))
+        let mut values = runs.iter().flat_map(|run| run.table.column(name));
+        values.any(|x| !x.is_nan())
     };
     other
         .filter(|other| !is_known(usual) && is_known(other))
@@ -121,15 +119,14 @@ fn panel(name: &str, runs: &[RunTable], window: f64, seeds: bool) -> Subplot {
         }
         curves = vec![mean_and_band(&curves)];
     }
-    let nothing = if name.starts_with(EVALUATION) {
-        "no evaluation yet"
-    } else {
-        "nothing yet"
-    };
     Subplot {
         title,
         curves,
-        nothing: nothing.to_owned(),
+        nothing: if name.starts_with(EVALUATION) {
+            "no evaluation yet"
+        } else {
+            "nothing yet"
+        },
     }
 }
 
@@ -138,10 +135,6 @@ fn panel(name: &str, runs: &[RunTable], window: f64, seeds: bool) -> Subplot {
 /// # Errors
 /// Fails if none of them can be drawn.
 fn runs(args: &PlotArgs, wanted: &[&str]) -> Result<Vec<RunTable>> {
-    let required = match args.along {
-        Along::Steps => &ALONG[..1],
-        Along::Hours => &ALONG,
-    };
     let mut runs = Vec::new();
     let mut known = HashSet::new();
     for (i, place) in args.runs.iter().enumerate() {
@@ -149,27 +142,8 @@ fn runs(args: &PlotArgs, wanted: &[&str]) -> Result<Vec<RunTable>> {
         if whole.is_ok_and(|whole| !known.insert(whole)) {
             continue;
         }
-        let table = run::read_metrics(place, required, wanted).and_then(|table| {
-            ensure!(
-                !table.columns[ALONG[0]].is_empty(),
-                "{}: no rows yet",
-                place.display()
-            );
-            Ok(table)
-        });
-        match table {
-            Ok(MetricsTable { names, columns }) => {
-                let along = match args.along {
-                    Along::Steps => columns[ALONG[0]].iter().map(|steps| steps / 1e6).collect(),
-                    Along::Hours => hours(&columns[ALONG[1]], &columns[ALONG[2]]),
-                };
-                runs.push(RunTable {
-                    name: name_of(place),
-                    along,
-                    names,
-                    columns,
-                });
-            }
+        match RunTable::read(place, args.along, wanted) {
+            Ok(run) => runs.push(run),
             Err(error) if runs.is_empty() && i + 1 == args.runs.len() => return Err(error),
             Err(error) => say!("warning: {error:#}; skipped"),
         }
@@ -180,8 +154,8 @@ fn runs(args: &PlotArgs, wanted: &[&str]) -> Result<Vec<RunTable>> {
 /// The control steps that are averaged into a point. They are as many for all runs, so that a table with fewer rows, as in docs/curves,
 /// is not smoothed more.
 fn window(runs: &[RunTable], smooth: Option<usize>) -> f64 {
-    let steps = || runs.iter().map(|run| &run.columns[ALONG[0]]);
-    let shortest = steps().map(Vec::len).min().unwrap_or(0);
+    let steps = || runs.iter().map(|run| run.table.column(ALONG[0]));
+    let shortest = steps().map(<[f64]>::len).min().unwrap_or(0);
     let rows = smooth.unwrap_or((shortest / 10).clamp(1, SMOOTH));
     let in_row = steps().filter_map(|steps| Some(steps.get(1)? - steps[0]));
     rows as f64 * in_row.fold(f64::INFINITY, f64::min)
@@ -193,28 +167,20 @@ fn window(runs: &[RunTable], smooth: Option<usize>) -> f64 {
 /// Fails on the first column that no run has, and names the nearest ones.
 fn expect_columns(runs: &[RunTable], metrics: &[String]) -> Result<()> {
     for name in metrics {
-        let lacking = runs.iter().filter(|run| !run.columns.contains_key(name));
+        let lacking = runs
+            .iter()
+            .filter(|run| !run.table.columns.contains_key(name));
         let lacking: Vec<&str> = lacking.map(|run| &run.name[..]).collect();
         if lacking.len() == runs.len() {
-            let mut known: Vec<&str> = runs
-                .iter()
-                .flat_map(|run| &run.names)
-                .map(String::as_str)
-                .collect();
-            known.sort_unstable();
-            known.dedup();
-            let mut nearest = similar(name, known.into_iter(), '/');
+            let known: BTreeSet<&String> = runs.iter().flat_map(|run| &run.table.names).collect();
+            let mut nearest = similar(name, known.into_iter().map(String::as_str), '/');
             nearest.truncate(SUGGESTIONS);
             let name: String = name.chars().take(64).collect();
-            match &nearest[..] {
-                [] => bail!(
-                    "no run has a column {name}; the first line of metrics.csv names all columns"
-                ),
-                nearest => bail!(
-                    "no run has a column {name}; did you mean {}?",
-                    nearest.join(" or ")
-                ),
-            }
+            let hint = match &nearest[..] {
+                [] => "the first line of metrics.csv names all columns".to_owned(),
+                nearest => format!("did you mean {}?", nearest.join(" or ")),
+            };
+            bail!("no run has a column {name}; {hint}");
         }
         if !lacking.is_empty() {
             say!("warning: no column {name} in {}", lacking.join(", "));
@@ -224,22 +190,42 @@ fn expect_columns(runs: &[RunTable], metrics: &[String]) -> Result<()> {
 }
 
 impl RunTable {
+    /// Reads the table of a run with these columns.
+    fn read(place: &Path, along: Along, wanted: &[&str]) -> Result<Self> {
+        let required = match along {
+            Along::Steps => &ALONG[..1],
+            Along::Hours => &ALONG,
+        };
+        let table = run::read_metrics(place, required, wanted)?;
+        let [steps, collect_s, update_s] = ALONG.map(|name| table.column(name));
+        ensure!(!steps.is_empty(), "{}: no rows yet", place.display());
+        let along = match along {
+            Along::Steps => steps.iter().map(|steps| steps / 1e6).collect(),
+            Along::Hours => hours(collect_s, update_s),
+        };
+        Ok(Self {
+            name: name_of(place),
+            along,
+            table,
+        })
+    }
     /// The curve of a metric, without points if the run has no such column. Each evaluation counts by itself, at the step at which it
     /// was made. Other values are averaged over windows of so many steps.
     fn curve(&self, name: &str, window: f64) -> Curve {
-        let Some(values) = self.columns.get(name) else {
+        let values = self.table.column(name);
+        if values.is_empty() {
             return Curve::default();
-        };
+        }
         let dots = name.starts_with(EVALUATION);
         let lengths = if dots {
             vec![1; values.len()]
         } else {
-            lengths_of_windows(&self.columns[ALONG[0]], window)
+            lengths_of_windows(self.table.column(ALONG[0]), window)
         };
         Curve {
             points: smooth(&self.along, values, &lengths),
-            band: Vec::new(),
             dots,
+            ..Curve::default()
         }
     }
 }
@@ -247,24 +233,21 @@ impl RunTable {
 /// The mean of these curves and the band from the lowest to the highest, where all of them have values. The points are those of the
 /// first curve, and the others are interpolated linearly.
 fn mean_and_band(curves: &[Curve]) -> Curve {
-    let dots = curves.iter().any(|curve| curve.dots);
     let mut mean = Curve {
-        dots,
+        dots: curves.iter().any(|curve| curve.dots),
         ..Curve::default()
     };
-    for &[x, _] in curves.first().map_or(&[][..], |curve| &curve.points) {
-        let Some(values) = curves
-            .iter()
-            .map(|curve| value_at(&curve.points, x))
-            .collect::<Option<Vec<f64>>>()
-        else {
+    for &[x, _] in curves.iter().take(1).flat_map(|first| &first.points) {
+        let values = curves.iter().map(|curve| value_at(&curve.points, x));
+        let Some(values) = values.collect::<Option<Vec<f64>>>() else {
             continue;
         };
+        let values = values.iter().copied();
         mean.points
-            .push([x, values.iter().sum::<f64>() / values.len() as f64]);
+            .push([x, values.clone().sum::<f64>() / curves.len() as f64]);
         mean.band.push([
-            values.iter().copied().fold(f64::INFINITY, f64::min),
-            values.iter().copied().fold(f64::NEG_INFINITY, f64::max),
+            values.clone().fold(f64::INFINITY, f64::min),
+            values.fold(f64::NEG_INFINITY, f64::max),
         ]);
     }
     mean
@@ -272,12 +255,10 @@ fn mean_and_band(curves: &[Curve]) -> Curve {
 
 /// The numbers of consecutive rows that lie in the same window of this many steps.
 fn lengths_of_windows(steps: &[f64], window: f64) -> Vec<usize> {
-    let first = steps[0];
     // Rounded, because steps are whole numbers and the window is a multiple of their difference.
+    let number = |step: &f64| ((step - steps[0]) / window + 1e-9).floor();
     steps
-        .chunk_by(|a, b| {
-            ((a - first) / window + 1e-9).floor() == ((b - first) / window + 1e-9).floor()
-        })
+        .chunk_by(|a, b| number(a) == number(b))
         .map(<[f64]>::len)
         .collect()
 }
@@ -302,19 +283,8 @@ fn name_of(place: &Path) -> String {
     } else {
         whole.file_stem()
     };
-    let name = name.map_or_else(
-        || place.display().to_string(),
-        |n| n.to_string_lossy().into(),
-    );
-    name.chars()
-        .map(|c| {
-            if c.is_control() {
-                char::REPLACEMENT_CHARACTER
-            } else {
-                c
-            }
-        })
-        .collect()
+    let name = name.unwrap_or(place.as_os_str()).to_string_lossy();
+    name.replace(char::is_control, "\u{fffd}")
 }
 
 /// The means over consecutive windows of these numbers of rows, `[x, value]`. Rows without a value are skipped, as are windows with
@@ -325,11 +295,8 @@ fn smooth(along: &[f64], values: &[f64], lengths: &[usize]) -> Vec<[f64; 2]> {
         let window = begin..begin + length;
         begin = window.end;
         let mean = |all: &[f64]| {
-            let known: Vec<f64> = all[window.clone()]
-                .iter()
-                .copied()
-                .filter(|value| value.is_finite())
-                .collect();
+            let mut known = all[window.clone()].to_vec();
+            known.retain(|value| value.is_finite());
             (!known.is_empty()).then(|| known.iter().sum::<f64>() / known.len() as f64)
         };
         Some([mean(along)?, mean(values)?])

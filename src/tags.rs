@@ -2,7 +2,7 @@
 //! TensorBoard are their names.
 
 use crate::repose::{
-    Better, Description, Lesson, MEASURES, OF_EVALUATIONS, OF_TRAINING, task_terms, training_terms,
+    Better, Description, Lesson, OF_EVALUATIONS, OF_TRAINING, measure, task_terms, training_terms,
 };
 
 /// A logged quantity.
@@ -13,22 +13,22 @@ pub struct Tag {
     pub description: String,
 }
 
-/// The groups of scores: the prefix of a name, its measures, what is added to a title, and the episodes.
+/// The groups of scores: the first part of a name, its measures, what is added to a title, and the episodes.
 const GROUPS: [(&str, &[&str], &str, &str); 3] = [
     (
-        "episode/",
+        "episode",
         &OF_TRAINING,
         "training",
         "Training episodes that ended in the iteration, without the randomised ones.",
     ),
     (
-        "randomized/",
+        "randomized",
         &OF_TRAINING,
         "randomised training",
         "Randomised training episodes that ended in the iteration.",
     ),
     (
-        "eval/",
+        "eval",
         &OF_EVALUATIONS,
         "evaluation",
         "Episodes of the task itself with mean actions.",
@@ -64,22 +64,26 @@ const OTHERS: [(&str, &str, &str); 21] = [
 
 /// The quantity with this name, if a training run logs it.
 pub fn tag(name: &str) -> Option<Tag> {
-    let other = OTHERS.iter().find(|(known, ..)| *known == name);
-    if let Some((_, title, description)) = other {
-        return Some(Tag {
-            title: (*title).to_owned(),
-            description: (*description).to_owned(),
-        });
+    for (known, title, description) in OTHERS {
+        if known == name {
+            return Some(Tag {
+                title: title.into(),
+                description: description.into(),
+            });
+        }
     }
     let (group, part) = name.split_once('/')?;
     let term = |list: &[Description]| {
-        let found = list.iter().find(|term| term.0 == part);
-        found.map(|term| format!("{}, mean per step.", term.1.trim_end_matches('.')))
+        let found = list.iter().find(|term| term.0 == part)?;
+        Some(format!("{}, mean per step.", found.1.trim_end_matches('.')))
     };
     let of_lesson = || {
-        Lesson::descriptions()
-            .find(|value| value.0 == part)
-            .map(|value| value.1.to_owned())
+        Some(
+            Lesson::descriptions()
+                .find(|value| value.0 == part)?
+                .1
+                .to_owned(),
+        )
     };
     let description = match group {
         "reward" => term(&task_terms()),
@@ -92,23 +96,20 @@ pub fn tag(name: &str) -> Option<Tag> {
             description,
         });
     }
-    GROUPS.iter().find_map(|(group, measures, of, episodes)| {
-        let column = name
-            .strip_prefix(group)
-            .filter(|column| measures.contains(column))?;
-        let measure = MEASURES.iter().find(|measure| measure.column == column)?;
-        let better = match measure.better {
-            Better::Higher => "Higher is better.",
-            Better::Lower => "Lower is better.",
-        };
-        // Charts show a share as a fraction.
-        let unit = match measure.unit {
-            "" | "%" => String::new(),
-            unit => format!(" ({unit})"),
-        };
-        Some(Tag {
-            title: format!("{}{unit}, {of}", measure.title),
-            description: format!("{} {episodes} {better}", measure.description),
-        })
+    let (_, measures, of, episodes) = GROUPS.iter().find(|(known, ..)| *known == group)?;
+    let column = measures.iter().find(|column| **column == part)?;
+    let measure = measure(column);
+    let better = match measure.better {
+        Better::Higher => "Higher is better.",
+        Better::Lower => "Lower is better.",
+    };
+    // Charts show a share as a fraction.
+    let unit = match measure.unit {
+        "" | "%" => String::new(),
+        unit => format!(" ({unit})"),
+    };
+    Some(Tag {
+        title: format!("{}{unit}, {of}", measure.title),
+        description: format!("{} {episodes} {better}", measure.description),
     })
 }

@@ -8,8 +8,7 @@ use anyhow::{Context, Result, bail};
 
 use crate::cli::{Made, ViewArgs, expect_together, usage_error};
 use crate::config::{Config, Settings, expect_used};
-#[cfg(any(feature = "video", feature = "viewer"))]
-use crate::evaluate::Episodes;
+
 use crate::evaluate::{Actor, Player};
 use crate::os::{self, say};
 use crate::repose::Task;
@@ -48,13 +47,12 @@ pub fn view(args: &ViewArgs) -> Result<()> {
         #[cfg(feature = "video")]
         (Some(to), _) => {
             crate::run::expect_output(&to.path, file, config.env.model_file())?;
-            let output = os::OutputFile::create(&to.path)?;
             let (_, actor) = &Actor::WITHOUT_POLICY[choice];
             let [width, height] = see::screenshot(
-                output,
+                os::OutputFile::create(&to.path)?,
                 &load()?,
                 actor,
-                Episodes::scored(args.seed, 1),
+                crate::evaluate::Episodes::scored(args.seed, 1),
                 args.at,
             )?;
             say!("{}: {width}x{height}", to.path.display());
@@ -78,8 +76,9 @@ pub fn fetch() -> Result<()> {
 
 #[cfg(feature = "viewer")]
 fn show(task: &Arc<Task>, choice: usize, seed: u64) -> Result<()> {
+    let episodes = crate::evaluate::Episodes::scored(seed, usize::MAX);
     match see::Window::open(task, Actor::WITHOUT_POLICY.into(), choice) {
-        Ok(window) => os::say_line(&window.play(task, Episodes::scored(seed, usize::MAX))?),
+        Ok(window) => os::say_line(&window.play(task, episodes)?),
         Err(error) => bail!("{error:#}\n  {INSTEAD}"),
     }
     Ok(())
@@ -99,24 +98,20 @@ fn task_for_display(config: &Config, look: &Look) -> Result<Arc<Task>> {
 /// Shows the scene on a page, with a slider for each actuator, for as long as the program runs.
 fn show_on_page(args: &ViewArgs, port: u16, task: &Arc<Task>, choice: usize) -> Result<()> {
     let sliders = see::Sliders::new(task);
-    let title = task
-        .config
-        .model_file()
-        .map_or("The built-in hand".into(), |file| {
-            file.display().to_string()
-        });
     let about = see::About {
-        title,
+        title: match task.config.model_file() {
+            Some(file) => file.display().to_string(),
+            None => "The built-in hand".into(),
+        },
         policy: None,
         seed: Some(args.seed),
     };
     let own = sliders.clone();
-    let step = move |player: &mut Player| {
-        let (_, actor) = &Actor::WITHOUT_POLICY[choice];
-        player.step_changed(actor, |action| own.change(action))
-    };
     let acting = see::LiveActor {
-        step: Rc::new(step),
+        step: Rc::new(move |player: &mut Player| {
+            let (_, actor) = &Actor::WITHOUT_POLICY[choice];
+            player.step_changed(actor, |action| own.change(action))
+        }),
         policy: None,
         task: task.clone(),
     };

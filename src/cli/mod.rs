@@ -118,11 +118,13 @@ pub fn command() -> clap::Command {
                 .fold(help, |help, (key, value)| help.replace(key, value)),
         )
     };
-    let program = env!("CARGO_PKG_VERSION");
-    let commit = env!("SHADOW_REPOSE_COMMIT");
-    let version = format!("{program} ({commit}, MuJoCo {})", sim::mujoco_version());
     Cli::command()
-        .version(version)
+        .version(format!(
+            "{} ({}, MuJoCo {})",
+            env!("CARGO_PKG_VERSION"),
+            env!("SHADOW_REPOSE_COMMIT"),
+            sim::mujoco_version()
+        ))
         .mut_subcommands(|command| command.mut_args(with_defaults))
 }
 

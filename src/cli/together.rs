@@ -112,20 +112,16 @@ type Row = (Made, &'static str, &'static [&'static str]);
 /// # Errors
 /// Fails with a sentence that says what the option goes with.
 pub fn expect_together(made: &[Made], given: &[String]) -> Result<(), String> {
-    let names = |of: &dyn Fn(&Row) -> bool, between: &str| {
-        let rows = GO_WITH.iter().filter(|row| of(row));
-        rows.map(|(_, name, _)| *name)
-            .collect::<Vec<_>>()
-            .join(between)
-    };
+    let rows = |of: &dyn Fn(&Row) -> bool| -> Vec<Row> { GO_WITH.into_iter().filter(of).collect() };
+    let names = |rows: &[Row]| Vec::from_iter(rows.iter().map(|(_, name, _)| *name));
     let is_made = |(row, ..): &Row| made.contains(row);
     for option in given {
-        let takes = |(.., options): &Row| options.contains(&&**option);
-        if GO_WITH.iter().any(takes) && !GO_WITH.iter().any(|row| is_made(row) && takes(row)) {
-            let here = names(&is_made, " and ");
-            let needed = names(&takes, " or ");
+        let takers = rows(&|(.., options)| options.contains(&&**option));
+        if !takers.is_empty() && !takers.iter().any(is_made) {
             return Err(format!(
-                "{option} cannot be used with {here}; it applies only to {needed}"
+                "{option} cannot be used with {}; it applies only to {}",
+                names(&rows(&is_made)).join(" and "),
+                names(&takers).join(" or ")
             ));
         }
     }
@@ -138,8 +134,7 @@ pub fn given(matches: &ArgMatches) -> Vec<String> {
         return Vec::new();
     };
     let ids = of_command.ids().map(clap::Id::as_str);
-    let given = ids.filter(|id| of_command.value_source(id) == Some(ValueSource::CommandLine));
-    given
+    ids.filter(|id| of_command.value_source(id) == Some(ValueSource::CommandLine))
         .map(|id| format!("--{}", id.replace('_', "-")))
         .collect()
 }

@@ -91,10 +91,11 @@ pub fn time(text: &str) -> Result<Duration, String> {
 }
 
 pub fn host(text: &str) -> Result<String, String> {
-    let is_name = |c: char| c.is_ascii_alphanumeric() || "-._".contains(c);
-    let is_host = !text.is_empty() && text.chars().all(is_name);
-    let advice = "must be a host name without a port, such as hub.example.org";
-    is_host.then(|| text.into()).ok_or(advice.into())
+    let is_foreign = |c: char| !c.is_ascii_alphanumeric() && !"-._".contains(c);
+    if text.is_empty() || text.contains(is_foreign) {
+        return Err("must be a host name without a port, such as hub.example.org".into());
+    }
+    Ok(text.into())
 }
 
 pub fn quality() -> impl TypedValueParser<Value = Quality> {

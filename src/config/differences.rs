@@ -2,9 +2,10 @@
 
 use toml::{Table, Value};
 
+use super::layers::MODEL;
 use super::overlay::{DEFAULTS, brief, lookup, settings};
 use super::ramp::Ramp;
-use super::settings::{BUILTIN_MODEL, Config, EnvConfig, RunConfig};
+use super::settings::{Config, EnvConfig};
 
 /// A setting by its dotted key, and its values in both configurations.
 pub type Difference = (String, [Value; 2]);
@@ -13,13 +14,9 @@ impl Config {
     /// Lists the settings that differ in `other`. Leaves out what may change during a run: the total number of steps, the
     /// number of threads and the path of the scene.
     pub fn differences(&self, other: &Self) -> Vec<String> {
-        let [own, other] = [self, other].map(|of| {
-            let mut same = of.clone();
-            same.env.model = BUILTIN_MODEL.into();
-            same
-        });
-        let differing = own.compared_with(&other).into_iter();
-        differing
+        self.compared_with(other)
+            .into_iter()
+            .filter(|(key, _)| key != MODEL)
             .map(|(key, [own, other])| format!("{key} = {other}, not {own}"))
             .collect()
     }
@@ -28,17 +25,16 @@ impl Config {
     pub fn compared_with(&self, other: &Self) -> Vec<Difference> {
         let [own, other] = [self, other].map(|of| {
             let mut same = of.clone();
-            same.run = RunConfig {
-                total_steps: 0,
-                threads: 0,
-                shards: of.shards(),
-                ..same.run
-            };
+            same.run.total_steps = 0;
+            same.run.threads = 0;
+            same.run.shards = of.shards();
             same.flat()
         });
-        let both = own.into_iter().zip(other);
-        let both = both.map(|((key, own), (_, other))| (key, [own, other]));
-        both.filter(|(_, [own, other])| own != other).collect()
+        own.into_iter()
+            .zip(other)
+            .map(|((key, own), (_, other))| (key, [own, other]))
+            .filter(|(_, [own, other])| own != other)
+            .collect()
     }
 
     /// All settings by dotted key, except settings that only divide the work, each of one type in every run: what may be a ramp or a
@@ -102,16 +98,15 @@ pub fn short(value: &Value) -> String {
 /// A value as part of another one, where text has quotes.
 fn inner(value: &Value) -> String {
     match value {
-        Value::Array(values) => format!(
-            "[{}]",
-            values.iter().map(inner).collect::<Vec<_>>().join(",")
-        ),
+        Value::Array(values) => {
+            let values = Vec::from_iter(values.iter().map(inner));
+            format!("[{}]", values.join(","))
+        }
         Value::Table(parts) => {
-            let parts: Vec<_> = parts
+            let parts = parts
                 .iter()
-                .map(|(key, value)| format!("{key}={}", inner(value)))
-                .collect();
-            format!("{{{}}}", parts.join(","))
+                .map(|(key, value)| format!("{key}={}", inner(value)));
+            format!("{{{}}}", Vec::from_iter(parts).join(","))
         }
         Value::Float(x) => brief(*x),
         value => value.to_string(),

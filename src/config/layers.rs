@@ -28,14 +28,15 @@ impl std::str::FromStr for Override {
     type Err = String;
 
     fn from_str(text: &str) -> Result<Self, String> {
-        let parts = text.split_once('=');
-        let parts = parts.map(|(key, value)| Self {
-            key: key.trim().into(),
-            value: value.trim().into(),
-        });
-        parts.filter(|parts| !parts.key.is_empty()).ok_or_else(|| {
-            format!("`{text}` is not of the form key=value, e.g. ppo.learning_rate=1e-4")
-        })
+        match text.split_once('=') {
+            Some((key, value)) if !key.trim().is_empty() => Ok(Self {
+                key: key.trim().into(),
+                value: value.trim().into(),
+            }),
+            _ => Err(format!(
+                "`{text}` is not of the form key=value, e.g. ppo.learning_rate=1e-4"
+            )),
+        }
     }
 }
 
@@ -70,10 +71,9 @@ impl Reader {
             return table;
         }
         let stored = model(&table).to_owned();
-        let asked = |Override { key, value }: &Override| {
+        let asked = sets.iter().rev().find_map(|Override { key, value }| {
             lookup(&table_of(key, value, &DEFAULTS), MODEL).cloned()
-        };
-        let asked = sets.iter().rev().find_map(asked);
+        });
         let is_kept = |place: &Value| match &*stored {
             BUILTIN_MODEL => *place != DEFAULTS["env"]["goal_position"],
             stored => asked
@@ -91,11 +91,10 @@ impl Reader {
                 // The sizes of its hand are part of the policy.
                 _ => !["num_envs", "num_hand_dofs", "num_actuators"].contains(&key),
             });
-            let Self::Player { env_steps } = self else {
-                continue;
-            };
             for (_, value) in keys {
-                if let Some(ramp) = Ramp::read(value) {
+                if let Self::Player { env_steps } = self
+                    && let Some(ramp) = Ramp::read(value)
+                {
                     *value = ramp.at(env_steps).into();
                 }
             }
@@ -313,10 +312,9 @@ impl Config {
         let mut text = String::new();
         for (section, keys) in &sections {
             text += &format!("[{section}]\n");
-            keys.as_table()
-                .into_iter()
-                .flatten()
-                .for_each(|(key, value)| text += &format!("{key} = {value}\n"));
+            for (key, value) in keys.as_table().into_iter().flatten() {
+                text += &format!("{key} = {value}\n");
+            }
             text.push('\n');
         }
         text
@@ -330,6 +328,14 @@ impl Source {
             path: path.into(),
             text: text.into(),
         }
+    }
+
+    /// The configuration that it makes over the base.
+    ///
+    /// # Errors
+    /// Fails as [`Settings::resolve`] does.
+    pub fn resolve(self) -> Result<Config> {
+        Settings::new().file(self).resolve()
     }
 
     /// Its settings. The base itself counts as setting nothing.

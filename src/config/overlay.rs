@@ -15,12 +15,9 @@ pub static DEFAULTS: LazyLock<Table> =
 
 /// The settings of all sections of a table, each with its dotted key.
 pub fn settings(table: &Table) -> impl Iterator<Item = (String, &Value)> {
-    let sections = table
-        .iter()
-        .filter_map(|(section, keys)| Some((section, keys.as_table()?)));
-    sections.flat_map(|(section, keys)| {
-        keys.iter()
-            .map(move |(key, value)| (format!("{section}.{key}"), value))
+    table.iter().flat_map(|(section, keys)| {
+        let keys = keys.as_table().into_iter().flatten();
+        keys.map(move |(key, value)| (format!("{section}.{key}"), value))
     })
 }
 
@@ -55,30 +52,21 @@ pub fn is_ramp(table: &Table) -> bool {
 /// for a string key. Numbers may lack the zero before their point, which TOML requires.
 pub fn table_of(key: &str, text: &str, merged: &Table) -> Table {
     let parse = |text: &str| {
-        format!("value = {text}")
-            .parse::<Table>()
-            .ok()
-            .filter(|t| t.len() == 1)
+        let mut table: Table = format!("value = {text}").parse().ok()?;
+        table.remove("value").filter(|_| table.is_empty())
     };
-    let parsed = parse(text)
-        .or_else(|| parse(&with_zeros(text)))
-        .and_then(|mut t| t.remove("value"));
     let wants_text = lookup(&DEFAULTS, key).is_some_and(Value::is_str);
-    let mut value = match parsed {
+    let mut value = match parse(text).or_else(|| parse(&with_zeros(text))) {
         Some(value) if !wants_text || value.is_str() => value,
-        _ => Value::String(text.to_owned()),
+        _ => text.into(),
     };
     // The deepest level is a part of a ramp in a section. Anything deeper belongs to an unknown name.
     let parts: Vec<&str> = key.splitn(3, '.').collect();
     for depth in (1..parts.len()).rev() {
         let whole = parts[..depth].join(".");
         // `env.noise.joint_pos` changes one value of `env.noise`, so the other values are copied.
-        let by_group = lookup(&DEFAULTS, &whole)
-            .and_then(Value::as_table)
-            .is_some_and(Table::is_empty);
-        let others = lookup(merged, &whole)
-            .and_then(Value::as_table)
-            .filter(|_| by_group);
+        let inside = |of| lookup(of, &whole).and_then(Value::as_table);
+        let others = inside(merged).filter(|_| inside(&DEFAULTS).is_some_and(Table::is_empty));
         let mut table = others.cloned().unwrap_or_default();
         table.insert(parts[depth].to_owned(), value);
         value = table.into();
@@ -93,21 +81,22 @@ fn with_zeros(text: &str) -> String {
         let joined = i > 0 && bytes[i - 1].is_ascii_alphanumeric();
         bytes[i] == b'.' && !joined && bytes.get(i + 1).is_some_and(u8::is_ascii_digit)
     };
-    text.char_indices()
-        .map(|(i, c)| {
-            if begins(i) {
-                "0.".to_owned()
-            } else {
-                c.to_string()
-            }
-        })
-        .collect()
+    let mut filled = String::new();
+    for (i, c) in text.char_indices() {
+        if begins(i) {
+            filled.push('0');
+        }
+        filled.push(c);
+    }
+    filled
 }
 
 /// Whether a value of `env.model` names the scene at the absolute path `stored`.
 pub fn names_scene(asked: &Value, stored: &str) -> bool {
-    let file = asked.as_str().map(|asked| Path::new(asked).canonicalize());
-    file.is_some_and(|file| file.is_ok_and(|file| file == Path::new(stored)))
+    asked.as_str().is_some_and(|asked| {
+        let file = Path::new(asked).canonicalize();
+        file.is_ok_and(|file| file == Path::new(stored))
+    })
 }
 
 /// The maximum number of problems to report. The first ones are enough to start with.
@@ -158,8 +147,10 @@ pub fn overlay(
         match typed(expected, value) {
             Ok(value) => drop(merged.insert(key.clone(), value)),
             Err(rule) => {
-                let number = value.as_float().filter(|x| x.is_finite());
-                let value = number.map_or_else(|| value.to_string(), brief);
+                let value = match value {
+                    Float(x) if x.is_finite() => brief(*x),
+                    value => value.to_string(),
+                };
                 problems.push(format!(
                     "{} = {}: must be {rule}",
                     shortened(&name),
@@ -172,21 +163,16 @@ pub fn overlay(
 
 /// What a value sets in a table of the base, if it fits: a plain number in place of a ramp is a constant.
 fn inner(expected: &Table, value: &Value) -> Option<Table> {
-    if is_ramp(expected) && number(value).is_some() {
+    let mut given = if is_ramp(expected) && number(value).is_some() {
         let parts = [
             ("from", value.clone()),
             ("to", value.clone()),
             ("steps", 0.into()),
-            ("after", 0.into()),
         ];
-        return Some(
-            parts
-                .into_iter()
-                .map(|(part, value)| (part.to_owned(), value))
-                .collect(),
-        );
-    }
-    let mut given = value.as_table()?.clone();
+        Table::from_iter(parts.map(|(part, value)| (part.to_owned(), value)))
+    } else {
+        value.as_table()?.clone()
+    };
     // A complete ramp without `after` starts at step 0, even if the default has an `after`. `to_text` relies on this.
     if is_ramp(expected)
         && ["from", "to", "steps"]
@@ -211,23 +197,18 @@ fn typed(expected: &Value, value: &Value) -> Result<Value, String> {
         }
         (Array(expected), Array(values)) => {
             // An empty list is a list of names.
-            let one = expected
-                .first()
-                .cloned()
-                .unwrap_or(Value::String(String::new()));
-            let typed: Result<Vec<_>, _> = values.iter().map(|v| typed(&one, v)).collect();
+            let one = expected.first().cloned().unwrap_or("".into());
+            let typed: Result<_, _> = values.iter().map(|value| typed(&one, value)).collect();
             typed
                 .map(Array)
                 .map_err(|rule| format!("an array of values that are each {rule}"))
         }
         (Value::Table(_), Value::String(text)) if text.starts_with('{') => {
             // A `--set` whose text could not be parsed.
-            let reason = format!("value = {}", with_zeros(text))
-                .parse::<Table>()
-                .err();
-            let reason = reason.map_or_else(String::new, |error| {
-                format!(": {}", shortened(error.message().trim()))
-            });
+            let reason = match format!("value = {}", with_zeros(text)).parse::<Table>() {
+                Ok(_) => String::new(),
+                Err(error) => format!(": {}", shortened(error.message().trim())),
+            };
             Err(format!("a table of TOML{reason}"))
         }
         _ => Err(type_of(expected)),
@@ -264,19 +245,15 @@ fn unknown(name: &str) -> String {
                 .collect()
         }
     };
-    let alike = similar(name, known.iter().map(String::as_str), '.');
+    let known = || known.iter().map(String::as_str);
     let end = |key: &str| key.rsplit('.').next().unwrap_or_default().to_owned();
-    let holds = known
-        .iter()
-        .map(String::as_str)
-        .find(|key| last.len() > 2 && end(key).contains(last));
-    let near = alike
-        .into_iter()
-        .find(|key| strsim::damerau_levenshtein(&end(key), last) <= 1 + last.len() / 4);
-    let all = "configs/repose.toml lists all of them";
-    let hint = near
-        .or(holds)
-        .map_or(all.into(), |nearest| format!("did you mean {nearest}?"));
+    let is_near = |key: &&str| strsim::damerau_levenshtein(&end(key), last) <= 1 + last.len() / 4;
+    let holds = |key: &&str| last.len() > 2 && end(key).contains(last);
+    let near = similar(name, known(), '.').into_iter().find(is_near);
+    let hint = match near.or(known().find(holds)) {
+        Some(nearest) => format!("did you mean {nearest}?"),
+        None => "configs/repose.toml lists all of them".into(),
+    };
     format!("{}: unknown key; {hint}", shortened(name))
 }
 

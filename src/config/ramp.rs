@@ -82,17 +82,14 @@ impl fmt::Display for Ramp {
             steps,
             after,
         } = self;
-        let after = if *after == 0 {
-            String::new()
-        } else {
-            format!(", after = {after}")
-        };
-        let constant = *self == Self::constant(*to);
-        if constant {
-            to.fmt(f)
-        } else {
-            write!(f, "{{ from = {from}, to = {to}, steps = {steps}{after} }}")
+        if *self == Self::constant(*to) {
+            return to.fmt(f);
         }
+        write!(f, "{{ from = {from}, to = {to}, steps = {steps}")?;
+        if *after > 0 {
+            write!(f, ", after = {after}")?;
+        }
+        f.write_str(" }")
     }
 }
 

@@ -8,13 +8,10 @@ use toml::{Table, Value};
 use super::overlay::{brief, lookup, number, settings};
 use super::settings::{Backend, Config, PpoConfig, Precision};
 use crate::os::shortened;
-use crate::sim::Parts;
 
-/// Keys, separated by spaces, the rule for their numbers, and its text.
-type Range = (&'static str, fn(f64) -> bool, &'static str);
-
-/// The ranges of settings. Both ends of a ramp must lie in its range, and so must all values by group.
-const RANGES: [Range; 5] = [
+/// The ranges of settings: keys, separated by spaces, the rule for their numbers, and its text. Both ends of a ramp must lie in its
+/// range, and so must all values by group.
+const RANGES: [(&str, fn(f64) -> bool, &str); 5] = [
     (
         "env.sim_dt env.ctrl_dt env.rot_eps env.success_tolerance env.fall_dist training.tolerance ppo.learning_rate ppo.clip \
          ppo.max_grad_norm ppo.reward_scale ppo.std",
@@ -72,9 +69,6 @@ pub const FARTHEST: f64 = 100.0;
 const LONGEST_PATH: usize = 4095;
 const LONGEST_NAME: usize = 255;
 
-/// The smallest and the largest magnitude of a nonzero value. Much is computed from these values in `f32`.
-const IN_F32: [f64; 2] = [1e-37, 1e38];
-
 /// Every rule that the values break, as "key = value: must …".
 pub fn violations(config: &Config) -> Vec<String> {
     let mut rules = Rules::default();
@@ -89,7 +83,7 @@ pub fn violations(config: &Config) -> Vec<String> {
     }
     magnitudes(&table, &mut rules);
     env(config, &mut rules);
-    hand(config, &mut rules);
+    hand(&table, &mut rules);
     randomization(config, &table, &mut rules);
     nets(config, &mut rules);
     samples(config, &mut rules);
@@ -99,29 +93,16 @@ pub fn violations(config: &Config) -> Vec<String> {
 
 fn magnitudes(table: &Table, rules: &mut Rules) {
     let limited = ["env.", "training.", "randomization."];
-    let [least, most] = IN_F32;
+    // Much is computed from these values in `f32`.
+    let [least, most] = [1e-37, 1e38];
     for (key, value) in settings(table).filter(|(key, _)| key != "training.hold") {
-        let most = if limited.iter().any(|section| key.starts_with(section)) {
-            LARGEST
-        } else {
-            most
-        };
-        let values = floats(value);
-        if let Some(&x) = values.iter().find(|x| x.abs() > most) {
-            rules.check(
-                false,
-                &key,
-                brief(x),
-                format!("be at most {} in magnitude", brief(most)),
-            );
-        }
-        if let Some(&x) = values.iter().find(|x| **x != 0.0 && x.abs() < least) {
-            rules.check(
-                false,
-                &key,
-                brief(x),
-                format!("be 0, or at least {least:e} in magnitude"),
-            );
+        let is_limited = limited.iter().any(|section| key.starts_with(section));
+        let most = if is_limited { LARGEST } else { most };
+        for x in floats(value) {
+            let rule = format!("be at most {} in magnitude", brief(most));
+            rules.check(x.abs() <= most, &key, brief(x), rule);
+            let rule = format!("be 0, or at least {least:e} in magnitude");
+            rules.check(x == 0.0 || x.abs() >= least, &key, brief(x), rule);
         }
     }
 }
@@ -136,36 +117,19 @@ fn floats(value: &Value) -> Vec<f64> {
     }
 }
 
-fn hand(config: &Config, rules: &mut Rules) {
-    let Parts {
-        joints,
-        actuators,
-        fingertips,
-        object,
-        goal,
-        start,
-    } = &config.hand;
-    let lists = [
-        ("hand.joints", joints),
-        ("hand.actuators", actuators),
-        ("hand.fingertips", fingertips),
-    ];
-    let listed = lists
-        .into_iter()
-        .flat_map(|(key, names)| names.iter().map(move |name| (key, name)));
-    let single = [
-        ("hand.object", object),
-        ("hand.goal", goal),
-        ("hand.start", start),
-    ];
-    for (key, name) in listed.chain(single.into_iter().filter(|(_, name)| !name.is_empty())) {
-        let fits = !name.is_empty() && name.len() <= 200 && !name.contains(char::is_control);
-        rules.check(
-            fits,
-            key,
-            shortened(name),
-            "hold names of 1 to 200 bytes without control characters",
-        );
+fn hand(table: &Table, rules: &mut Rules) {
+    for (key, value) in settings(table).filter(|(key, _)| key.starts_with("hand.")) {
+        let names = match value {
+            Value::Array(names) => &names[..],
+            // It names nothing.
+            Value::String(name) if name.is_empty() => &[],
+            name => std::slice::from_ref(name),
+        };
+        for name in names.iter().filter_map(Value::as_str) {
+            let fits = (1..=200).contains(&name.len()) && !name.contains(char::is_control);
+            let rule = "hold names of 1 to 200 bytes without control characters";
+            rules.check(fits, &key, name, rule);
+        }
     }
 }
 
@@ -175,60 +139,50 @@ fn env(config: &Config, rules: &mut Rules) {
     let near = place.iter().all(|x| x.abs() <= FARTHEST);
     let rule = format!("have coordinates of at most {FARTHEST} m");
     rules.check(near, "env.goal_position", format!("{place:?}"), rule);
-    let names = |path: &str| path.split('/').all(|name| name.len() <= LONGEST_NAME);
-    let is_path = |path: &str| {
-        (1..=LONGEST_PATH).contains(&path.len()) && names(path) && !path.contains(char::is_control)
-    };
-    rules.check(
-        is_path(&env.model),
-        "env.model",
-        &env.model,
-        "be a path or \"builtin\"",
-    );
+    let model = &env.model;
+    let is_path = (1..=LONGEST_PATH).contains(&model.len())
+        && model.split('/').all(|name| name.len() <= LONGEST_NAME)
+        && !model.contains(char::is_control);
+    rules.check(is_path, "env.model", model, "be a path or \"builtin\"");
     let ratio = env.ctrl_dt / env.sim_dt;
     let whole = (1.0..=1e4).contains(&ratio.round()) && (ratio / ratio.round() - 1.0).abs() < 1e-6;
-    let rule = format!(
-        "be a whole multiple of env.sim_dt = {}, at most 10000 times it",
-        env.sim_dt
-    );
     rules.check(
         whole || ratio.is_nan() || ratio <= 0.0,
         "env.ctrl_dt",
         env.ctrl_dt,
-        rule,
+        format!(
+            "be a whole multiple of env.sim_dt = {}, at most 10000 times it",
+            env.sim_dt
+        ),
     );
     let steps = (env.max_episode_seconds / env.ctrl_dt).round();
-    let rule = "last between one and 1e9 steps of env.ctrl_dt";
     rules.check(
         (1.0..=1e9).contains(&steps),
         "env.max_episode_seconds",
         env.max_episode_seconds,
-        rule,
+        "last between one and 1e9 steps of env.ctrl_dt",
     );
 }
 
 fn randomization(config: &Config, table: &Table, rules: &mut Rules) {
     let env = &config.env;
-    let drawn = &config.randomization;
     // A factor that is drawn from a range also has a setting in [env].
     for (key, value) in table["randomization"].as_table().into_iter().flatten() {
         let Some([Value::Float(low), Value::Float(high)]) = value.as_array().map(Vec::as_slice)
         else {
             continue;
         };
-        let name = format!("randomization.{key}");
-        let range = format!("[{low}, {high}]");
         rules.check(
             0.0 < *low && low <= high,
-            &name,
-            range,
+            &format!("randomization.{key}"),
+            format!("[{low}, {high}]"),
             "be [low, high] with 0 < low <= high",
         );
         let scale = format!("{key}_scale");
         let factor = table["env"][&scale].as_float().expect("a factor");
         rules.check(factor > 0.0, &format!("env.{scale}"), factor, "be above 0");
     }
-    let [low, high] = drawn.delay;
+    let [low, high] = config.randomization.delay;
     let range = format!("[{low}, {high}]");
     rules.check(
         low <= high,
@@ -254,39 +208,38 @@ fn randomization(config: &Config, table: &Table, rules: &mut Rules) {
             format!("be at most {LONGEST_DELAY}"),
         );
     }
-    let is_seen = env.prediction == 0 || env.vel_obs_scale != 0.0;
     rules.check(
-        is_seen,
+        env.prediction == 0 || env.vel_obs_scale != 0.0,
         "env.vel_obs_scale",
         env.vel_obs_scale,
         "not be 0 with env.prediction: velocities must be observed",
     );
-    let rule =
-        format!("be, with env.action_delay, shorter than an episode, which lasts {steps} steps");
     let longest = env.action_delay.saturating_add(high);
     rules.check(
         high == 0 || longest < steps,
         "randomization.delay",
         &range,
-        rule,
+        format!("be, with env.action_delay, shorter than an episode, which lasts {steps} steps"),
     );
-    let rule = format!("be, with env.action_delay, at most {LONGEST_DELAY}");
-    rules.check(longest <= LONGEST_DELAY, "randomization.delay", range, rule);
+    rules.check(
+        longest <= LONGEST_DELAY,
+        "randomization.delay",
+        range,
+        format!("be, with env.action_delay, at most {LONGEST_DELAY}"),
+    );
 }
 
 fn nets(config: &Config, rules: &mut Rules) {
     let hidden = &config.ppo.hidden;
-    let sizes_fit =
-        (1..=64).contains(&hidden.len()) && hidden.iter().all(|h| (1..=16384).contains(h));
     let sizes = format!("{:?}", &hidden[..hidden.len().min(65)]);
     rules.check(
-        sizes_fit,
+        (1..=64).contains(&hidden.len()) && hidden.iter().all(|h| (1..=16384).contains(h)),
         "ppo.hidden",
         &sizes,
         "hold one to 64 sizes from 1 to 16384",
     );
-    let weights = hidden.windows(2).fold(0_usize, |sum, pair| {
-        sum.saturating_add(pair[0].saturating_mul(pair[1]))
+    let weights = hidden.array_windows().fold(0_usize, |sum, [a, b]| {
+        sum.saturating_add(a.saturating_mul(*b))
     });
     rules.check(
         weights <= 1 << 25,
@@ -299,9 +252,7 @@ fn nets(config: &Config, rules: &mut Rules) {
 fn samples(config: &Config, rules: &mut Rules) {
     let ppo = &config.ppo;
     let horizon = ppo.horizon;
-    let whole = [horizon.from, horizon.to]
-        .iter()
-        .all(|steps| steps.fract() == 0.0);
+    let whole = horizon.from.fract() == 0.0;
     let multiple = horizon.from < 1.0 || whole && horizon.to % horizon.from == 0.0;
     rules.check(
         multiple,
@@ -334,12 +285,10 @@ fn samples(config: &Config, rules: &mut Rules) {
 }
 
 fn learning(ppo: &PpoConfig, rules: &mut Rules) {
-    let computable = ppo.precision == Precision::F32 || ppo.backend == Backend::Fused;
-    let precision = Value::try_from(ppo.precision).expect("a string");
     rules.check(
-        computable,
+        ppo.precision == Precision::F32 || ppo.backend == Backend::Fused,
         "ppo.precision",
-        precision,
+        Value::try_from(ppo.precision).expect("a string"),
         "be \"f32\" with ppo.backend = \"candle\"",
     );
     let [low, high] = ppo.learning_rate_range;
@@ -362,11 +311,10 @@ fn learning(ppo: &PpoConfig, rules: &mut Rules) {
         "be [low, high] with 0 < low <= high",
     );
     let [near, far] = ppo.away_range;
-    let range = format!("[{near}, {far}]");
     rules.check(
         0.0 <= near && near < far,
         "ppo.away_range",
-        range,
+        format!("[{near}, {far}]"),
         "be [near, far] with 0 <= near < far",
     );
 }
@@ -401,8 +349,9 @@ impl Rules {
         match lookup(table, key).expect("a setting") {
             // The other parts of a ramp are counts of steps.
             Value::Table(parts) => {
-                let floats = parts.iter().filter(|(_, value)| value.is_float());
-                floats.for_each(|(part, value)| check(&format!("{key}.{part}"), value));
+                for (part, value) in parts.iter().filter(|(_, value)| value.is_float()) {
+                    check(&format!("{key}.{part}"), value);
+                }
             }
             value => check(key, value),
         }

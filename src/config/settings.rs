@@ -250,15 +250,13 @@ impl Config {
 
     /// The number of shards: the configured one or, if that is 0, the largest that fits, up to 16.
     pub fn shards(&self) -> usize {
-        let found = [16, 8, 4, 2]
-            .into_iter()
-            .find(|&shards| self.divides(shards))
-            .unwrap_or(1);
-        if self.run.shards == 0 {
-            found
-        } else {
-            self.run.shards
+        if self.run.shards > 0 {
+            return self.run.shards;
         }
+        let fitting = [16, 8, 4, 2]
+            .into_iter()
+            .find(|&shards| self.divides(shards));
+        fitting.unwrap_or(1)
     }
 
     /// Whether environments and minibatches can be divided evenly into `shards`.
@@ -284,8 +282,7 @@ impl PpoConfig {
     /// The number of samples in a minibatch of a rollout with this many samples and this horizon. It is the same for all
     /// horizons of a run.
     pub fn minibatch_of(&self, samples: usize, horizon: usize) -> usize {
-        let in_first = samples / (horizon / self.first_horizon());
-        in_first / self.minibatches
+        samples / (horizon / self.first_horizon()) / self.minibatches
     }
 
     /// How far a value may move from its value at collection time, or infinity if `value_clip` is 0.
@@ -308,9 +305,8 @@ impl RandomizationConfig {
 impl EnvConfig {
     /// The task after `env_steps` control steps of a run: actions are smoothed as much as training has come to smooth them.
     pub fn at(&self, env_steps: u64) -> Self {
-        let act_moving_average = Ramp::constant(self.act_moving_average.at(env_steps));
         Self {
-            act_moving_average,
+            act_moving_average: Ramp::constant(self.act_moving_average.at(env_steps)),
             ..self.clone()
         }
     }

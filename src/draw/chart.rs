@@ -16,7 +16,7 @@ pub struct Subplot {
     /// Curves, at the places of their names in the legend.
     pub curves: Vec<Curve>,
     /// The word that is shown if no curve has a point.
-    pub nothing: String,
+    pub nothing: &'static str,
 }
 
 /// A line through points.
@@ -35,7 +35,7 @@ pub struct Chart {
     /// The names of the curves, in the order that all panels have them.
     pub legend: Vec<String>,
     /// The label of the x axis.
-    pub along: String,
+    pub along: &'static str,
     /// Panels, from top to bottom.
     pub panels: Vec<Subplot>,
     /// Width and height in pixels. By default 800 wide, and as high as the legend plus 260 for each panel.
@@ -162,16 +162,8 @@ pub fn draw_text(
 
 /// A text without the characters that XML does not allow.
 fn printable(text: &str) -> String {
-    let allowed = |c: char| !c.is_control() && !matches!(c, '\u{fffe}' | '\u{ffff}');
-    text.chars()
-        .map(|c| {
-            if allowed(c) {
-                c
-            } else {
-                char::REPLACEMENT_CHARACTER
-            }
-        })
-        .collect()
+    let forbidden = |c: char| c.is_control() || matches!(c, '\u{fffe}' | '\u{ffff}');
+    text.replace(forbidden, "\u{fffd}")
 }
 
 impl Picture for Chart {
@@ -196,8 +188,8 @@ impl Picture for Chart {
         area.fill(&WHITE)?;
         let rows = self.legend_rows(area.dim_in_pixel().0);
         let (top, below) = area.split_vertically(legend_height(&rows));
-        for (i, row) in rows.into_iter().enumerate() {
-            let y = (MARGIN + ROW * i as u32 + ROW / 2) as i32;
+        for (row, i) in rows.into_iter().zip(0..) {
+            let y = (MARGIN + ROW * i + ROW / 2) as i32;
             for (name, (colour, dash), left) in row {
                 top.draw(&DashedPathElement::new(
                     [(left, y), (left + LINE, y)],
@@ -213,19 +205,13 @@ impl Picture for Chart {
                 )?;
             }
         }
-        let last = self.panels.len() - 1;
-        let x = range(
-            self.panels
-                .iter()
-                .flat_map(|panel| panel.curves.iter().flat_map(Curve::along)),
-        );
-        for (i, (panel, part)) in self
-            .panels
-            .iter()
-            .zip(below.split_evenly((self.panels.len(), 1)))
-            .enumerate()
-        {
-            panel.draw(&part, x.clone(), (i == last).then_some(&self.along[..]))?;
+        let curves = self.panels.iter().flat_map(|panel| &panel.curves);
+        let x = range(curves.flat_map(Curve::along));
+        let count = self.panels.len();
+        let parts = below.split_evenly((count, 1));
+        for ((panel, part), number) in self.panels.iter().zip(parts).zip(1..) {
+            let along = (number == count).then_some(self.along);
+            panel.draw(&part, x.clone(), along)?;
         }
         Ok(area.present()?)
     }
@@ -326,7 +312,7 @@ impl Subplot {
             let (width, height) = part.dim_in_pixel();
             draw_text(
                 part,
-                &self.nothing,
+                self.nothing,
                 (width as i32 / 2, height as i32 / 2),
                 (HPos::Center, 15, BLACK),
             )?;
@@ -358,12 +344,10 @@ impl Curve {
     ) -> Result<()> {
         let points = || self.points.iter().map(|&[x, y]| (x, y));
         if !self.band.is_empty() {
-            let edge = |side: usize| {
-                self.along()
-                    .zip(self.band.iter().map(move |band| band[side]))
-            };
-            let upper: Vec<_> = edge(1).collect();
-            let outline: Vec<_> = edge(0).chain(upper.into_iter().rev()).collect();
+            let corners = self.points.iter().zip(&self.band);
+            let lower = corners.clone().map(|([x, _], [low, _])| (*x, *low));
+            let upper = corners.map(|([x, _], [_, high])| (*x, *high));
+            let outline: Vec<_> = lower.chain(upper.rev()).collect();
             // Opaque and below the line, since not every SVG viewer supports opacity.
             let (red, green, blue) = colour.color.rgb();
             let pale = |channel: u8| 255 - (255 - channel) / 4;

@@ -130,16 +130,12 @@ fn table(rows: usize, columns: usize, value: impl Fn(usize, usize) -> i64) -> Ve
 /// The factor of each column, and the rows as a table of integers.
 fn packed_rows(rows: &[Vec<f64>], counts: &[usize]) -> (Vec<f64>, Vec<u8>) {
     let columns = rows.first().map_or(0, Vec::len);
-    let largest = |column: usize| {
-        rows.iter()
-            .fold(1e-9, |most: f64, row| most.max(row[column].abs()))
-    };
     let scale = |column| {
         if counts.contains(&column) {
-            1.0
-        } else {
-            largest(column) / LARGEST
+            return 1.0;
         }
+        let sizes = rows.iter().map(|row| row[column].abs());
+        sizes.fold(1e-9, f64::max) / LARGEST
     };
     let scale: Vec<f64> = (0..columns).map(scale).collect();
     let packed = table(rows.len(), columns, |row, column| {
@@ -151,12 +147,13 @@ fn packed_rows(rows: &[Vec<f64>], counts: &[usize]) -> (Vec<f64>, Vec<u8>) {
 /// The entry of a mesh in the scene, and its bytes: points as a table in its bounding box, normals by axis, corners of
 /// triangles.
 fn packed_mesh((corners, triangles): &Mesh) -> (Value, Vec<u8>) {
-    let bounds = |pick: fn(f32, f32) -> f32, start: f32| {
-        [0, 1, 2].map(|axis| {
+    let bounds = |pick: fn(f32, f32) -> f32, start| {
+        let along = |axis| {
             corners
                 .iter()
-                .fold(start, |bound, (point, _)| pick(bound, point[axis]))
-        })
+                .map(move |(point, _): &([f32; 3], _)| point[axis])
+        };
+        [0, 1, 2].map(|axis| along(axis).fold(start, pick))
     };
     let low = bounds(f32::min, f32::INFINITY);
     let high = bounds(f32::max, f32::NEG_INFINITY);
@@ -165,12 +162,10 @@ fn packed_mesh((corners, triangles): &Mesh) -> (Value, Vec<u8>) {
         (f64::from(corners[corner].0[axis] - low[axis]) / step[axis]).round() as i64 - 32768
     };
     let mut bytes = table(corners.len(), 3, point);
-    let normal = |axis: usize| {
-        corners
-            .iter()
-            .map(move |(_, normal)| (normal[axis] * 127.0).round() as i8 as u8)
-    };
-    bytes.extend((0..3).flat_map(normal));
+    for axis in 0..3 {
+        let normals = corners.iter().map(|(_, normal)| normal[axis]);
+        bytes.extend(normals.map(|x| (x * 127.0).round() as i8 as u8));
+    }
     bytes.extend(table(3 * triangles.len(), 1, |place, _| {
         triangles[place / 3][place % 3] as i64
     }));

@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::rc::Rc;
 
-use anyhow::{Context, Result, bail, ensure};
+use anyhow::{Context, Result, ensure};
 use serde_json::{Value, json};
 use toml::Table;
 
@@ -25,25 +25,22 @@ const BUILT_IN: &str = "built into the program";
 
 /// What a page says about who acts in episodes that are drawn from this seed.
 pub fn about(stage: &Stage, seed: u64) -> About {
-    let name = stage.described();
-    let policy = stage.origin().zip(name.as_deref());
+    let policy = stage.origin().zip(stage.described());
     described(stage.actor().name(), policy, Some(seed))
 }
 
 /// What a page says about an actor, the place and the description of its policy, and a seed.
-fn described(actor: &str, policy: Option<(String, &str)>, seed: Option<u64>) -> About {
-    let title = match &policy {
-        Some((place, _)) if place.ends_with(BUILT_IN) => "A built-in policy".to_owned(),
-        Some((place, _)) => place.clone(),
-        None => format!("{}{}", actor[..1].to_uppercase(), &actor[1..]),
-    };
-    let policy = policy.map(|(_, name)| match actor {
-        "policy" => name.to_owned(),
-        other => format!("{name} ({other})"),
-    });
+fn described(actor: &str, policy: Option<(String, String)>, seed: Option<u64>) -> About {
     About {
-        title,
-        policy,
+        title: match &policy {
+            Some((place, _)) if place.ends_with(BUILT_IN) => "A built-in policy".to_owned(),
+            Some((place, _)) => place.clone(),
+            None => format!("{}{}", actor[..1].to_uppercase(), &actor[1..]),
+        },
+        policy: policy.map(|(_, name)| match actor {
+            "policy" => name,
+            other => format!("{name} ({other})"),
+        }),
         seed,
     }
 }
@@ -98,11 +95,8 @@ pub fn live(
     let stage = Rc::new(stage);
     let mut about = about(&stage, seed);
     if let Some(followed) = &followed {
-        about = About {
-            title: followed.run.place().display().to_string(),
-            policy: None,
-            ..about
-        };
+        about.title = followed.run.place().display().to_string();
+        about.policy = None;
     }
     let mut acting = stage.clone().acting(task.clone());
     let live = Live::open(place, (&about, shot.camera), hands as usize, &acting, None)?;
@@ -111,7 +105,7 @@ pub fn live(
             choice: stage.choice,
             ..Stage::find(Some(path), set)?
         };
-        let record = |stage: &Stage| stage.loaded().map(|loaded| loaded.record.clone());
+        let record = |stage: &Stage| stage.policy.as_ref().map(|policy| policy.record.clone());
         ensure!(
             record(&newer) == record(&stage),
             "{} is for another hand",
@@ -121,10 +115,9 @@ pub fn live(
         let mut acting = Rc::new(newer).acting(own);
         // The page shows the settings of the first policy.
         for (key, value) in acting.task.config.unlike(&task.config) {
-            acting
-                .policy
-                .iter_mut()
-                .for_each(|name| *name += &format!(", {key} {}", short(&value)));
+            if let Some(name) = &mut acting.policy {
+                *name += &format!(", {key} {}", short(&value));
+            }
         }
         Ok(acting)
     };
@@ -166,13 +159,10 @@ pub fn from_trace(
         cannot()
     );
     let header = header(&text).with_context(cannot)?;
-    if let Some(set) = set
-        .iter()
-        .find(|set| set.key != MODEL && !set.key.starts_with("hand."))
-    {
-        bail!(
-            "--set {}: a trace has its own settings; only {MODEL} and the parts of the hand can be set",
-            set.key
+    for Override { key, .. } in set {
+        ensure!(
+            key == MODEL || key.starts_with("hand."),
+            "--set {key}: a trace has its own settings; only {MODEL} and the parts of the hand can be set"
         );
     }
     let stored = settings(path, &header).with_context(cannot)?;
@@ -182,9 +172,8 @@ pub fn from_trace(
         .resolve()
         .with_context(cannot)?;
     let task = Task::new(&config)?;
-    let joints = json!(task.hand.parts.joints);
     ensure!(
-        header["joint_names"] == joints,
+        header["joint_names"] == json!(task.hand.parts.joints),
         "{}: it was recorded with another hand, which has other joints",
         cannot()
     );
@@ -208,21 +197,21 @@ fn of_trace(header: &Value) -> About {
         .filter(|actor| actor.is_ascii() && !actor.is_empty())
         .unwrap_or("policy");
     let warnings = header["warnings"].as_array().into_iter().flatten();
-    let warnings: Vec<&str> = warnings.filter_map(Value::as_str).collect();
-    warnings
-        .iter()
-        .for_each(|warning| say!("warning: {warning}"));
+    let warnings = warnings.filter_map(Value::as_str);
+    for warning in warnings.clone() {
+        say!("warning: {warning}");
+    }
     let policy = header["checkpoint"].as_str();
-    let name = policy.map(|place| with_warnings(place, warnings.iter().copied()));
-    let policy = policy.map(str::to_owned).zip(name.as_deref());
+    let policy = policy.map(|place| (place.to_owned(), with_warnings(place, warnings)));
     described(actor, policy, header["seed"].as_u64())
 }
 
 /// The first record of a trace.
 fn header(text: &str) -> Result<Value> {
-    let header = serde_json::from_str::<Value>(text.lines().next().unwrap_or_default()).ok();
-    let header = header.filter(|header| header.get("observation").is_some());
-    header.context("it does not begin with the header of a trace")
+    let header: Option<Value> = serde_json::from_str(text.lines().next().unwrap_or_default()).ok();
+    header
+        .filter(|header| header.get("observation").is_some())
+        .context("it does not begin with the header of a trace")
 }
 
 /// The settings of the header of a trace as a configuration file.

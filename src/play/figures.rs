@@ -13,27 +13,27 @@ pub fn json_score(
     checkpoint: Option<&str>,
     seed: u64,
 ) -> Value {
-    let mut object = score.as_json();
-    object.insert("checkpoint".to_owned(), json!(checkpoint));
-    object.insert("seed".to_owned(), json!(seed));
+    let mut object = Value::Object(score.as_json());
+    object["checkpoint"] = json!(checkpoint);
+    object["seed"] = json!(seed);
     for (name, known) in goal_times.named() {
-        object.insert(name.to_owned(), known);
+        object[name] = known;
     }
-    Value::Object(object)
+    object
 }
 
 /// A table with a row for each measure and a column for each named score. Two columns fit into 60 characters.
 pub fn table(columns: &[(&str, Score)]) -> String {
     let mut text = format!("{:<21}", "");
-    columns
-        .iter()
-        .for_each(|(name, _)| text += &format!(" {name:>18}"));
+    for (name, _) in columns {
+        text += &format!(" {name:>18}");
+    }
     let columns: Vec<_> = columns.iter().map(|(_, score)| lines(score)).collect();
     for (row, (label, _)) in columns[0].iter().enumerate() {
         text += &format!("\n{label:<21}");
-        columns
-            .iter()
-            .for_each(|column| text += &format!(" {:>18}", column[row].1));
+        for column in &columns {
+            text += &format!(" {:>18}", column[row].1);
+        }
     }
     text + "\n"
 }
@@ -48,10 +48,8 @@ fn lines(score: &Score) -> Vec<(String, String)> {
             lines.push(("  95 % interval".to_owned(), format!("{low} … {high}")));
         }
     }
-    lines.extend(
-        named(task_terms(), score.reward)
-            .map(|(term, value)| (format!("  {term}"), number(value, 2))),
-    );
+    let terms = named(task_terms(), score.reward);
+    lines.extend(terms.map(|(term, value)| (format!("  {term}"), number(value, 2))));
     lines.push(("diverged episodes".to_owned(), score.diverged.to_string()));
     lines
 }

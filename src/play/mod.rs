@@ -8,7 +8,6 @@ mod plan;
 mod score;
 mod stage;
 
-use std::path::Path;
 use std::process::ExitCode;
 
 use anyhow::{Result, bail};
@@ -16,8 +15,7 @@ use anyhow::{Result, bail};
 pub use self::figures::json_score;
 
 use self::browser::Followed;
-#[cfg(feature = "viewer")]
-use self::plan::Outputs;
+
 use self::plan::Plan;
 use self::score::score;
 use self::stage::{Stage, task};
@@ -27,8 +25,6 @@ use crate::evaluate::Episodes;
 use crate::os::{self, Requests, say};
 use crate::robustness::robustness;
 use crate::see;
-#[cfg(feature = "viewer")]
-use crate::sim::Look;
 
 /// What to do where no window can be opened.
 const INSTEAD: &str = "Without a window, --web shows the hand in a browser, --out hand.html writes a file for one, and --headless scores.";
@@ -45,7 +41,7 @@ pub fn play(args: &PlayArgs, requests: &Requests) -> Result<ExitCode> {
         Plan::Replay(trace, to, shot) => browser::from_trace(&trace, &to, &shot, &args.set),
         Plan::Web(port, shot) => {
             let followed = args.follow.then(|| Followed::find(place)).transpose()?;
-            let newest: Option<&Path> = followed.as_ref().map(|followed| &*followed.path);
+            let newest = followed.as_ref().map(|followed| &*followed.path);
             let stage = Stage::set(newest.or(place), args)?;
             browser::live(
                 ((port, args.shot.web_host.as_deref()), args.hands),
@@ -58,8 +54,9 @@ pub fn play(args: &PlayArgs, requests: &Requests) -> Result<ExitCode> {
         Plan::Robustness(report) => {
             requests.wait_for_end();
             let stage = Stage::set(place, args)?;
-            let load =
-                |changes: &[Override]| task(stage.loaded(), &[&args.set[..], changes].concat());
+            let load = |changes: &[Override]| {
+                task(stage.policy.as_ref(), &[&args.set[..], changes].concat())
+            };
             robustness(
                 &load,
                 &stage.actor(),
@@ -91,14 +88,24 @@ pub fn play(args: &PlayArgs, requests: &Requests) -> Result<ExitCode> {
 
 /// Plays in a window. If none can be opened and none was asked for, plays for the score.
 #[cfg(feature = "viewer")]
-fn show(stage: &Stage, shot: &Look, args: &PlayArgs, requests: &Requests) -> Result<ExitCode> {
+fn show(
+    stage: &Stage,
+    shot: &crate::sim::Look,
+    args: &PlayArgs,
+    requests: &Requests,
+) -> Result<ExitCode> {
     let task = see::task_for_display(&stage.task, shot)?;
     match see::Window::open(&task, stage.actors(), stage.choice) {
         Ok(window) => os::say_line(&window.play(&task, episodes(args, u64::MAX))?),
         Err(error) if args.window => bail!("{error:#}\n  {INSTEAD}"),
         Err(error) => {
             say!("note: {error:#}\n  {INSTEAD} The score follows.");
-            return score(stage, episodes(args, 256), &Outputs::of(args)?, requests);
+            return score(
+                stage,
+                episodes(args, 256),
+                &plan::Outputs::of(args)?,
+                requests,
+            );
         }
     }
     Ok(ExitCode::SUCCESS)

@@ -116,18 +116,16 @@ fn shot(args: &PlayArgs, size: [u32; 2], quality: Quality) -> Look {
 /// # Errors
 /// Fails if there are two.
 fn only(out: &[Destination], kind: &str, endings: &[&str]) -> Result<Option<Destination>, Error> {
-    let found: Vec<&Destination> = out
-        .iter()
-        .filter(|to| endings.contains(&to.ending))
-        .collect();
-    if let [one, other, ..] = found[..] {
+    let mut found = out.iter().filter(|to| endings.contains(&to.ending));
+    let one = found.next();
+    if let Some((one, other)) = one.zip(found.next()) {
         let [one, other] = [one, other].map(|to| to.path.display());
         return Err(usage_error(
             "play",
             &format!("--out {one} --out {other}: of {kind}, one is written"),
         ));
     }
-    Ok(found.first().copied().cloned())
+    Ok(one.cloned())
 }
 
 #[cfg(test)]

@@ -2,8 +2,6 @@
 
 use std::process::ExitCode;
 
-#[cfg(not(feature = "video"))]
-use anyhow::bail;
 use anyhow::{Context, Result};
 
 use super::browser::about;
@@ -13,8 +11,7 @@ use super::plan::Outputs;
 use super::stage::Stage;
 use crate::evaluate::{Actor, Episodes, Moment, Trial};
 use crate::goal_times::GoalTimes;
-#[cfg(feature = "video")]
-use crate::os::Destination;
+
 use crate::os::{self, Requests, say};
 use crate::repose::Score;
 use crate::see;
@@ -46,7 +43,7 @@ pub fn score(
     };
     let played = match &outputs.film {
         #[cfg(not(feature = "video"))]
-        Some(_) => bail!(see::NO_FILMS),
+        Some(_) => anyhow::bail!(see::NO_FILMS),
         #[cfg(feature = "video")]
         Some(to) => film(to, outputs, trial, requests, &mut observe)?,
         None => scored(trial, &mut observe)?,
@@ -56,10 +53,9 @@ pub fn score(
         return Ok(os::exit_code(requests.signal()));
     };
     files.finish(&about(stage, episodes.seed))?;
-    played
-        .divergence()
-        .into_iter()
-        .for_each(|warning| say!("warning: {warning}"));
+    if let Some(warning) = played.divergence() {
+        say!("warning: {warning}");
+    }
     if outputs.json {
         os::print(&format!(
             "{}\n",
@@ -97,7 +93,7 @@ fn scored(trial: Trial, observe: &mut dyn FnMut(&Moment)) -> Result<Option<Score
 /// Plays the episodes one after another and films them. If interrupted, it leaves a film of what was played.
 #[cfg(feature = "video")]
 fn film(
-    to: &Destination,
+    to: &os::Destination,
     Outputs { shot, fps, .. }: &Outputs,
     trial: Trial,
     requests: &Requests,

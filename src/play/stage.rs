@@ -39,19 +39,20 @@ impl Stage {
             );
             stage.choice = 1;
         }
-        let file = stage.loaded().and_then(|loaded| loaded.origin.file());
+        let file = stage
+            .policy
+            .as_ref()
+            .and_then(|policy| policy.origin.file());
         expect_outputs(&args.out, file, stage.task.config.model_file())?;
         os::start_threads(args.threads)?;
-        if let Some(loaded) = stage.loaded().filter(|_| !args.json) {
-            say!("playing {}", loaded.name);
+        if let Some(policy) = stage.policy.as_ref().filter(|_| !args.json) {
+            say!("playing {}", policy.name);
         }
         stage.task.say_warnings();
         if !args.json {
-            stage
-                .task
-                .notes()
-                .iter()
-                .for_each(|note| say!("note: {note}"));
+            for note in stage.task.notes() {
+                say!("note: {note}");
+            }
         }
         Ok(stage)
     }
@@ -61,19 +62,14 @@ impl Stage {
     /// # Errors
     /// Fails as [`Loaded::find`] and [`Loaded::task`] do.
     pub fn find(place: Option<&Path>, set: &[Override]) -> Result<Self> {
-        if let Some(choice) = place.and_then(Actor::without_policy) {
-            return Ok(Self {
-                policy: None,
-                choice,
-                task: task(None, set)?,
-            });
-        }
-        let loaded = Loaded::find(place, set)?;
-        let task = task(Some(&loaded), set)?;
+        let (policy, choice) = match place.and_then(Actor::without_policy) {
+            Some(choice) => (None, choice),
+            None => (Some(Loaded::find(place, set)?), 0),
+        };
         Ok(Self {
-            policy: Some(loaded),
-            choice: 0,
-            task,
+            task: task(policy.as_ref(), set)?,
+            policy,
+            choice,
         })
     }
 
@@ -101,38 +97,30 @@ impl Stage {
         self.actors().swap_remove(self.choice).1
     }
 
-    /// The policy in its file.
-    pub fn loaded(&self) -> Option<&Loaded> {
-        self.policy.as_ref()
-    }
-
     /// Where the policy comes from.
     pub fn origin(&self) -> Option<String> {
-        self.loaded().map(|loaded| loaded.origin.to_string())
+        self.policy.as_ref().map(|policy| policy.origin.to_string())
     }
 
     /// Where the policy comes from, or the name of the actor.
     pub fn place(&self) -> String {
-        self.origin()
-            .unwrap_or_else(|| self.actor().name().to_owned())
+        self.origin().unwrap_or(self.actor().name().to_owned())
     }
 
     /// What a page says of the policy: its description, and where it does not fit well.
     pub fn described(&self) -> Option<String> {
         let warnings = self.task.warnings.iter().map(String::as_str);
-        Some(with_warnings(&self.loaded()?.name, warnings))
+        Some(with_warnings(&self.policy.as_ref()?.name, warnings))
     }
 
     /// The actor of a page that shows this task.
     pub fn acting(self: Rc<Self>, task: Arc<Task>) -> LiveActor {
-        let policy = self.described();
-        let step = move |player: &mut Player| {
-            let (_, actor) = &self.actors_of(Policy::freeze_briefly)[self.choice];
-            player.step(actor)
-        };
         LiveActor {
-            step: Rc::new(step),
-            policy,
+            policy: self.described(),
+            step: Rc::new(move |player: &mut Player| {
+                let (_, actor) = &self.actors_of(Policy::freeze_briefly)[self.choice];
+                player.step(actor)
+            }),
             task,
         }
     }
@@ -142,13 +130,10 @@ impl Stage {
 ///
 /// # Errors
 /// Fails as [`Loaded::task`] does.
-pub fn task(loaded: Option<&Loaded>, set: &[Override]) -> Result<Arc<Task>> {
-    match loaded {
-        Some(loaded) => loaded.task(set),
-        None => Settings::new()
-            .sets(set)
-            .resolve()
-            .and_then(|config| Task::new(&config)),
+pub fn task(policy: Option<&Loaded>, set: &[Override]) -> Result<Arc<Task>> {
+    match policy {
+        Some(policy) => policy.task(set),
+        None => Task::new(&Settings::new().sets(set).resolve()?),
     }
 }
 
@@ -157,10 +142,8 @@ fn expect_outputs(out: &[Destination], policy: Option<&Path>, scene: Option<&Pat
     for (i, Destination { path, .. }) in out.iter().enumerate() {
         run::expect_output(path, policy, scene)?;
         let end = os::final_path(path);
-        let is_taken = end.is_some()
-            && out[..i]
-                .iter()
-                .any(|other| os::final_path(&other.path) == end);
+        let mut others = out[..i].iter();
+        let is_taken = end.is_some() && others.any(|other| os::final_path(&other.path) == end);
         ensure!(
             !is_taken,
             "--out {}: one file cannot be both",

@@ -15,31 +15,10 @@ pub const CHECKPOINTS: &str = "checkpoints";
 /// The folder `checkpoints` of a run.
 #[derive(Clone, Debug)]
 pub struct Checkpoints {
-    folder: Folder,
+    pub(super) folder: Folder,
 }
 
 impl Checkpoints {
-    pub(super) fn new(run: &Path) -> Self {
-        Self {
-            folder: Folder::at(run.join(CHECKPOINTS)),
-        }
-    }
-
-    /// The path by which they are reached.
-    pub(super) fn path(&self) -> &Path {
-        &self.folder.path
-    }
-
-    /// The path where the folder lies now.
-    pub(super) fn place(&self) -> PathBuf {
-        self.folder.place()
-    }
-
-    /// The folder lies in a run with this path from now on.
-    pub(super) fn lie_in(&mut self, run: &Path) {
-        self.folder.name = run.join(CHECKPOINTS);
-    }
-
     /// Creates the folder unless it exists, and holds it open.
     ///
     /// # Errors
@@ -50,16 +29,17 @@ impl Checkpoints {
 
     /// The path of the newest checkpoint.
     pub fn latest(&self) -> PathBuf {
-        self.path().join("latest.safetensors")
+        self.folder.path.join("latest.safetensors")
     }
 
     /// The path of the checkpoint that scored best.
     pub fn best(&self) -> PathBuf {
-        self.path().join("best.safetensors")
+        self.folder.path.join("best.safetensors")
     }
 
     fn path_of(&self, iteration: u64) -> PathBuf {
-        self.path()
+        self.folder
+            .path
             .join(format!("iteration-{iteration:08}.safetensors"))
     }
 
@@ -80,9 +60,10 @@ impl Checkpoints {
         for (_, path) in earlier.iter().skip(keep) {
             nicety(fs::remove_file(path));
         }
-        later
-            .iter()
-            .try_for_each(|(_, path)| put_aside(path, "later").map(drop).cannot("rename", path))
+        for (_, path) in later {
+            put_aside(&path, "later").cannot("rename", &path)?;
+        }
+        Ok(())
     }
 
     /// Writes the checkpoint that scored best.
@@ -123,9 +104,11 @@ impl Checkpoints {
 
     /// The checkpoints named after iterations, the newest first.
     fn numbered(&self) -> Vec<(u64, PathBuf)> {
-        let entries = fs::read_dir(self.path()).into_iter().flatten().flatten();
-        let files = entries.filter(|entry| entry.file_type().is_ok_and(|kind| kind.is_file()));
-        let numbered = files.filter_map(|entry| {
+        let entries = fs::read_dir(&self.folder.path)
+            .into_iter()
+            .flatten()
+            .flatten();
+        let numbered = entries.filter_map(|entry| {
             let name = entry.file_name();
             let number = name
                 .to_str()?
@@ -133,7 +116,8 @@ impl Checkpoints {
                 .strip_suffix(".safetensors")?
                 .parse()
                 .ok()?;
-            Some((number, entry.path()))
+            let is_file = entry.file_type().is_ok_and(|kind| kind.is_file());
+            is_file.then(|| (number, entry.path()))
         });
         let mut numbered: Vec<_> = numbered.collect();
         numbered.sort_unstable_by(|a, b| b.cmp(a));
@@ -169,7 +153,7 @@ mod tests {
     use super::*;
 
     fn names(checkpoints: &Checkpoints) -> Vec<String> {
-        let entries = fs::read_dir(checkpoints.path()).unwrap();
+        let entries = fs::read_dir(&checkpoints.folder.path).unwrap();
         let mut names: Vec<String> = entries
             .map(|entry| entry.unwrap().file_name().into_string().unwrap())
             .collect();
@@ -177,10 +161,16 @@ mod tests {
         names
     }
 
+    fn checkpoints_of(run: &Path) -> Checkpoints {
+        Checkpoints {
+            folder: Folder::at(run.join(CHECKPOINTS)),
+        }
+    }
+
     #[test]
     fn the_newest_are_kept_and_latest_names_the_newest() {
         let place = tempfile::tempdir().unwrap();
-        let mut checkpoints = Checkpoints::new(place.path());
+        let mut checkpoints = checkpoints_of(place.path());
         checkpoints.hold().unwrap();
         for iteration in [0, 20, 40, 60] {
             checkpoints
@@ -223,7 +213,7 @@ mod tests {
     #[test]
     fn later_ones_are_put_aside_when_an_earlier_one_is_gone_on_from() {
         let place = tempfile::tempdir().unwrap();
-        let mut checkpoints = Checkpoints::new(place.path());
+        let mut checkpoints = checkpoints_of(place.path());
         checkpoints.hold().unwrap();
         for iteration in [20, 40, 60, 30] {
             checkpoints.write(iteration, b"", 3).unwrap();
@@ -237,7 +227,7 @@ mod tests {
     #[test]
     fn what_was_there_stays_when_the_next_cannot_be_written() {
         let place = tempfile::tempdir().unwrap();
-        let mut checkpoints = Checkpoints::new(place.path());
+        let mut checkpoints = checkpoints_of(place.path());
         checkpoints.hold().unwrap();
         checkpoints.write(20, b"good", 1).unwrap();
         // A folder with this name cannot be replaced, not even by root.

@@ -61,10 +61,10 @@ impl EventFile {
             file,
             undescribed: tags.clone(),
         };
-        let begun = events.begin(first_step, settings);
-        begun
-            .inspect_err(|_| drop(fs::remove_file(&events.path)))
-            .map(|()| events)
+        events
+            .begin(first_step, settings)
+            .inspect_err(|_| drop(fs::remove_file(&events.path)))?;
+        Ok(events)
     }
 
     fn begin(&mut self, first_step: u64, settings: &str) -> Result<()> {
@@ -92,9 +92,10 @@ impl EventFile {
         values: &[(impl AsRef<str>, f64)],
         histograms: &[(&'static str, Histogram)],
     ) -> Result<()> {
-        let numbers = values.iter().filter(|(_, number)| !number.is_nan());
-        let numbers =
-            numbers.map(|(tag, number)| (tag.as_ref(), Content::simple_value(*number as f32)));
+        let numbers = values
+            .iter()
+            .filter(|(_, number)| !number.is_nan())
+            .map(|(tag, number)| (tag.as_ref(), Content::simple_value(*number as f32)));
         let histograms = histograms
             .iter()
             .map(|(tag, histogram)| (*tag, Content::histo(histogram.clone())));
@@ -178,22 +179,17 @@ pub fn cut_off_after(folder: &Path, last_step: u64) -> Result<()> {
 pub fn event_files(folder: &Path) -> Result<Vec<(u64, PathBuf)>> {
     let [begin, end] = NAME;
     let entries = fs::read_dir(folder).cannot("read", folder)?;
-    let files = entries
-        .flatten()
-        .filter(|entry| entry.file_type().is_ok_and(|kind| kind.is_file()));
-    let ours = files.filter_map(|entry| {
+    let ours = entries.flatten().filter_map(|entry| {
         let name = entry.file_name();
         let (seconds, _) = name
             .to_str()?
             .strip_prefix(begin)?
             .strip_suffix(end)?
             .split_once('.')?;
+        let seconds: u64 = seconds.parse().ok()?;
         // Bounded, so that adding to it cannot overflow.
-        let seconds = seconds
-            .parse()
-            .ok()
-            .filter(|&seconds: &u64| seconds < 1 << 40)?;
-        Some((seconds, entry.path()))
+        let is_ours = seconds < 1 << 40 && entry.file_type().is_ok_and(|kind| kind.is_file());
+        is_ours.then(|| (seconds, entry.path()))
     });
     Ok(ours.collect())
 }

@@ -72,7 +72,9 @@ pub struct RunFolder {
 impl RunFolder {
     pub(super) fn at(path: PathBuf) -> Self {
         Self {
-            checkpoints: Checkpoints::new(&path),
+            checkpoints: Checkpoints {
+                folder: Folder::at(path.join(CHECKPOINTS)),
+            },
             stop_before: modified(&path.join(STOP)),
             folder: Folder::at(path),
         }
@@ -90,16 +92,12 @@ impl RunFolder {
 
     /// Where it lies now, and where its checkpoints lie if that is elsewhere.
     pub fn whereabouts(&self) -> String {
-        let (run, checkpoints) = (self.place(), shown(&self.checkpoints.place()));
-        let run = run.display();
-        if same_file(&checkpoints, &self.path().join(CHECKPOINTS)) {
-            run.to_string()
-        } else {
-            format!(
-                "{run}, and its checkpoints lie in {}",
-                checkpoints.display()
-            )
+        let mut text = self.place().display().to_string();
+        let checkpoints = shown(&self.checkpoints.folder.place());
+        if !same_file(&checkpoints, &self.path().join(CHECKPOINTS)) {
+            text += &format!(", and its checkpoints lie in {}", checkpoints.display());
         }
+        text
     }
 
     /// Creates the folder of a new run: `path`, or runs/shadow-hand-repose/DATE-TIME[-NAME].
@@ -107,8 +105,10 @@ impl RunFolder {
     /// # Errors
     /// Fails if the folder already holds a run, lies inside one, or cannot be written to.
     pub fn create(path: Option<&Path>, name: Option<&str>) -> Result<(Self, Locked)> {
-        let mut run =
-            Self::at(path.map_or_else(|| create_unused(name), |path| Ok(path.to_owned()))?);
+        let mut run = Self::at(match path {
+            Some(path) => path.to_owned(),
+            None => create_unused(name)?,
+        });
         run.expect_free()?;
         let lock = run.lock()?;
         sync_folder(&run.place());
@@ -144,9 +144,8 @@ impl RunFolder {
             .unwrap_or_default();
         let above = there.ancestors().skip(usize::from(whole.exists()));
         for folder in above.map(|path| Self::at(path.to_owned())) {
-            let holds_a_run = folder.checkpoints.begun() || folder.path().join(LOCK).exists();
             ensure!(
-                !holds_a_run,
+                !folder.holds_a_run(),
                 "{} lies inside the run {}",
                 self.place().display(),
                 folder.path().display()
@@ -155,13 +154,20 @@ impl RunFolder {
         Ok(())
     }
 
+    /// Whether a run has saved anything here, or was locked here.
+    pub(super) fn holds_a_run(&self) -> bool {
+        self.checkpoints.begun() || self.path().join(LOCK).exists()
+    }
+
     /// Creates a run folder among the temporary files, for a run whose own folder cannot be written to.
     ///
     /// # Errors
     /// Fails if the folder cannot be created.
     pub fn for_now() -> Result<Self> {
-        let folder = tempfile::Builder::new().prefix("shadow-repose-").tempdir();
-        let folder = folder.cannot("create a folder in", &std::env::temp_dir())?;
+        let folder = tempfile::Builder::new()
+            .prefix("shadow-repose-")
+            .tempdir()
+            .cannot("create a folder in", &std::env::temp_dir())?;
         let mut run = Self::at(folder.keep());
         run.checkpoints.hold()?;
         Ok(run)
@@ -211,7 +217,7 @@ impl RunFolder {
             ),
         };
         // A folder that may not be listed or entered would look empty.
-        let folder = run.checkpoints.path();
+        let folder = &run.checkpoints.folder.path;
         match fs::read_dir(folder).and_then(|_| fs::metadata(folder.join("."))) {
             Err(error) if error.kind() != ErrorKind::NotFound => Err(error).cannot("read", folder),
             _ => Ok(run),
@@ -237,7 +243,7 @@ impl RunFolder {
             );
         }
         let lock = Locked::acquire(self.path())?;
-        self.checkpoints.lie_in(&self.folder.path);
+        self.checkpoints.folder.name = self.path().join(CHECKPOINTS);
         self.checkpoints.hold()?;
         Ok(lock)
     }
@@ -323,11 +329,10 @@ impl RunFolder {
     /// Fails if the file cannot be read.
     pub fn config(&self) -> Result<Option<(PathBuf, String)>> {
         let path = self.path().join(CONFIG);
-        if path.exists() {
-            read_text(&path).map(|text| Some((shown(&path), text)))
-        } else {
-            Ok(None)
+        if !path.exists() {
+            return Ok(None);
         }
+        Ok(Some((shown(&path), read_text(&path)?)))
     }
 
     /// Writes the configuration and the facts about the program, each only if the folder does not hold the same text already.
@@ -360,10 +365,10 @@ pub fn resolve_checkpoint(place: &Path) -> Result<PathBuf> {
         return Ok(place.to_owned());
     }
     let checkpoints = RunFolder::containing(place)?.checkpoints;
-    let found = [checkpoints.best(), checkpoints.latest()]
+    [checkpoints.best(), checkpoints.latest()]
         .into_iter()
-        .find(|path| path.exists());
-    found.with_context(|| format!("{} holds no checkpoint", place.display()))
+        .find(|path| path.exists())
+        .with_context(|| format!("{} holds no checkpoint", place.display()))
 }
 
 /// The folder of the newest run that has a checkpoint, if any.
@@ -388,13 +393,11 @@ fn create_unused(name: Option<&str>) -> Result<PathBuf> {
         "the name {name} of a run may contain only letters, digits, `-`, `_` and `.`"
     );
     fs::create_dir_all(RUNS).cannot("create the folder of runs", Path::new(RUNS))?;
-    let time = jiff::Zoned::now().strftime("%Y-%m-%d_%H-%M-%S").to_string();
-    let suffix = if name.is_empty() {
-        String::new()
-    } else {
-        format!("-{name}")
-    };
-    let path = Path::new(RUNS).join(format!("{time}{suffix}"));
+    let mut unique = jiff::Zoned::now().strftime("%Y-%m-%d_%H-%M-%S").to_string();
+    if !name.is_empty() {
+        unique += &format!("-{name}");
+    }
+    let path = Path::new(RUNS).join(unique);
     loop {
         let path = unused_name(&path);
         match fs::create_dir(&path) {
@@ -443,7 +446,7 @@ mod tests {
             "checkpoints/x.partial",
         ] {
             let mut run = RunFolder::at(place.path().join("run"));
-            fs::create_dir_all(run.checkpoints.path()).unwrap();
+            fs::create_dir_all(&run.checkpoints.folder.path).unwrap();
             std::os::unix::fs::symlink(&victim, run.path().join(name)).unwrap();
             let refusal = run.lock().unwrap_err().to_string();
             assert!(
@@ -478,7 +481,8 @@ mod tests {
         let (mut run, lock) = RunFolder::create(Some(place.path()), None).unwrap();
         let left = run
             .checkpoints
-            .path()
+            .folder
+            .path
             .join(".shadow-repose-999999999-0.partial");
         fs::write(&left, "half").unwrap();
         let living = crate::os::OutputFile::create(&place.path().join("trace")).unwrap();
@@ -538,10 +542,10 @@ mod tests {
         let place = tempfile::tempdir().unwrap();
         let (run, _lock) = RunFolder::create(Some(&place.path().join("run")), None).unwrap();
         write_whole(&run.checkpoints.latest(), b"latest").unwrap();
-        let found = RunFolder::containing(run.checkpoints.path()).unwrap();
+        let found = RunFolder::containing(&run.checkpoints.folder.path).unwrap();
         assert!(same_file(found.path(), run.path()), "{found:?}");
         assert!(same_file(
-            &resolve_checkpoint(run.checkpoints.path()).unwrap(),
+            &resolve_checkpoint(&run.checkpoints.folder.path).unwrap(),
             &run.checkpoints.latest()
         ));
     }

@@ -35,8 +35,7 @@ impl Glance {
                 .ok()
                 .filter(Metadata::is_file)
         };
-        let written =
-            |facts: &Option<Metadata>| facts.as_ref().and_then(|facts| facts.modified().ok());
+        let written = |facts: &Option<Metadata>| facts.as_ref()?.modified().ok();
         let [config, metrics, lock, mark] = [CONFIG, METRICS, LOCK, FINISHED].map(facts);
         if config.is_none() && metrics.is_none() && lock.is_none() {
             return None;
@@ -70,10 +69,9 @@ pub fn folders_of_runs(folder: Option<&Path>, waits: bool) -> Result<Vec<PathBuf
         );
     }
     let entries = fs::read_dir(path).cannot("read the folder", path)?;
-    let is_folder = |entry: &fs::DirEntry| entry.file_type().is_ok_and(|kind| kind.is_dir());
     Ok(entries
         .flatten()
-        .filter(is_folder)
+        .filter(|entry| entry.file_type().is_ok_and(|kind| kind.is_dir()))
         .map(|entry| entry.path())
         .collect())
 }

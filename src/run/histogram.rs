@@ -12,36 +12,22 @@ pub type Histogram = HistogramProto;
 /// Counts `values`, which must be finite.
 pub fn histogram<'a>(values: impl Iterator<Item = &'a f32> + Clone) -> Histogram {
     let values = values.map(|&x| f64::from(x));
-    let (min, max) = values
-        .clone()
-        .fold((f64::INFINITY, f64::NEG_INFINITY), |(a, b), x| {
-            (a.min(x), b.max(x))
-        });
+    let min = values.clone().fold(f64::INFINITY, f64::min);
+    let max = values.clone().fold(f64::NEG_INFINITY, f64::max);
     // All values may be the same.
     let bins = if max > min { BINS } else { 1 };
     let width = (max - min) / bins as f64;
-    let bucket_limit = (1..=bins)
-        .map(|i| {
-            if i == bins {
-                max
-            } else {
-                min + width * i as f64
-            }
-        })
-        .collect();
+    let limits = (1..bins).map(|i| min + width * i as f64);
     let mut found = Histogram {
         min,
         max,
-        bucket_limit,
+        bucket_limit: limits.chain([max]).collect(),
         bucket: vec![0.0; bins],
         ..Histogram::default()
     };
     for x in values {
-        let bin = if width > 0.0 {
-            ((x - min) / width) as usize
-        } else {
-            0
-        };
+        // Without a width, it is NaN, which becomes 0.
+        let bin = ((x - min) / width) as usize;
         found.bucket[bin.min(bins - 1)] += 1.0;
         found.num += 1.0;
         found.sum += x;

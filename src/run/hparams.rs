@@ -23,9 +23,6 @@ use crate::os::Cannot;
 /// The name of the folder.
 pub const HPARAMS: &str = "hparams";
 
-/// The class of data of a tensor (`DataClass` in TensorBoard's summary.proto).
-const TENSOR: u32 = 2;
-
 /// Begins the row of the run in `folder` anew, at this step, with these settings by dotted key.
 ///
 /// # Errors
@@ -63,22 +60,17 @@ pub fn end(succeeded: bool) -> Result<Vec<Summary_Value>> {
 }
 
 /// The message `SessionStartInfo`.
-fn start_info(settings: &Table) -> Result<Vec<u8>> {
-    let entries: Result<Vec<_>> = settings
-        .iter()
-        .map(|(key, value)| entry(key, value))
-        .collect();
-    let entries = entries?;
+fn start_info(settings: &Table) -> ProtobufResult<Vec<u8>> {
     message(|out| {
-        entries
-            .iter()
-            .try_for_each(|entry| out.write_bytes(1, entry))?;
+        for (key, value) in settings {
+            out.write_bytes(1, &entry(key, value)?)?;
+        }
         out.write_double(5, now())
     })
 }
 
 /// An entry of the map of settings: a key, and a `google.protobuf.Value`.
-fn entry(key: &str, value: &Value) -> Result<Vec<u8>> {
+fn entry(key: &str, value: &Value) -> ProtobufResult<Vec<u8>> {
     let value = message(|out| match value {
         Value::Integer(x) => out.write_double(2, *x as f64),
         Value::Float(x) => out.write_double(2, *x),
@@ -105,13 +97,16 @@ fn session_value(name: &str, field: u32, info: &[u8]) -> Result<Summary_Value> {
         &format!("_hparams_/{name}"),
         Content::tensor(nothing),
         HPARAMS,
-        TENSOR,
+        // A tensor (`DataClass` in TensorBoard's summary.proto).
+        2,
     );
     value.mut_metadata().mut_plugin_data().set_content(content);
     Ok(value)
 }
 
-fn message(write: impl FnOnce(&mut CodedOutputStream) -> ProtobufResult<()>) -> Result<Vec<u8>> {
+fn message(
+    write: impl FnOnce(&mut CodedOutputStream) -> ProtobufResult<()>,
+) -> ProtobufResult<Vec<u8>> {
     let mut bytes = Vec::new();
     let mut out = CodedOutputStream::vec(&mut bytes);
     write(&mut out)?;

@@ -1,12 +1,12 @@
 //! Which files an output may not replace.
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use anyhow::{Result, bail, ensure};
 
 use super::checkpoints::CHECKPOINTS;
 use super::folder::{DIVERGED, FINISHED, OURS, RunFolder, is_one_of};
-use crate::os::{LOCK, final_path, same_file};
+use crate::os::{final_path, same_file};
 use crate::sim::scene_files;
 
 /// The names of the files in the folders of the checkpoints and of the dumps of a run. A star stands for anything.
@@ -25,15 +25,15 @@ const INSIDE: [&str; 7] = [
 ///
 /// # Errors
 /// Fails if it does, even through links, or as [`scene_files`] does.
-pub fn expect_output<'a>(
+pub fn expect_output(
     path: &Path,
-    read: impl IntoIterator<Item = &'a Path>,
+    read: impl IntoIterator<Item: AsRef<Path>>,
     scene: Option<&Path>,
 ) -> Result<()> {
     let of_scene = scene.map(scene_files).transpose()?;
     let mut read = read
         .into_iter()
-        .map(PathBuf::from)
+        .map(|read| read.as_ref().to_owned())
         .chain(of_scene.unwrap_or_default());
     if let Some(read) = read.find(|read| same_file(path, read)) {
         bail!(
@@ -42,31 +42,23 @@ pub fn expect_output<'a>(
             read.display()
         );
     }
-    let Some(whole) = final_path(path) else {
-        return Ok(());
-    };
+    let whole = final_path(path).unwrap_or_default();
     let Some((folder, name)) = whole.parent().zip(whole.file_name()) else {
         return Ok(());
     };
     let inside = folder.ends_with(CHECKPOINTS) || folder.ends_with(DIVERGED);
-    let run = RunFolder::at(
-        folder
-            .parent()
-            .filter(|_| inside)
-            .unwrap_or(folder)
-            .to_owned(),
-    );
-    let is_run = run.checkpoints.begun() || run.path().join(LOCK).exists();
+    let place = folder.parent().filter(|_| inside).unwrap_or(folder);
+    let run = RunFolder::at(place.to_owned());
     let is_kept = if inside {
         is_one_of(name, &INSIDE)
     } else {
         name == FINISHED || is_one_of(name, &OURS)
     };
-    let place = run.path().display();
     ensure!(
-        !is_run || !is_kept,
-        "{}: the run {place} reserves this file name; choose another name",
-        path.display()
+        !run.holds_a_run() || !is_kept,
+        "{}: the run {} reserves this file name; choose another name",
+        path.display(),
+        place.display()
     );
     Ok(())
 }
@@ -77,9 +69,8 @@ pub fn expect_output<'a>(
 /// Fails if it does.
 pub fn expect_other_policy(folder: &Path, init: &Path) -> Result<()> {
     let own = RunFolder::at(folder.to_owned()).policy();
-    let replaces = same_file(&own, init);
     ensure!(
-        !replaces,
+        !same_file(&own, init),
         "{}: would replace the policy that the run starts from; choose another folder",
         own.display()
     );

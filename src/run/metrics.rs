@@ -45,12 +45,11 @@ impl Metrics {
         };
         let mut expected = iterations.end - iterations.start;
         if found.is_none() {
-            let aside =
-                put_aside(path, &format!("before-{}.csv", iterations.end)).cannot("write", path)?;
-            let aside = shown(&aside);
-            let aside = aside.display();
+            let extension = format!("before-{}.csv", iterations.end);
+            let aside = put_aside(path, &extension).cannot("write", path)?;
             tell(&format!(
-                "{METRICS} has a different header from the one this program writes; it was renamed to {aside}"
+                "{METRICS} has a different header from the one this program writes; it was renamed to {}",
+                shown(&aside).display()
             ));
             expected = 0;
         }
@@ -69,9 +68,9 @@ impl Metrics {
             .open(path)
             .cannot("write", path)?;
         if found.kept < expected && path.is_file() {
-            let lacking = expected - found.kept;
             tell(&format!(
-                "{METRICS} lacks {lacking} of the {expected} rows up to iteration {}",
+                "{METRICS} lacks {} of the {expected} rows up to iteration {}",
+                expected - found.kept,
                 iterations.end
             ));
         }

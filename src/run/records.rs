@@ -4,7 +4,7 @@
 //! TensorFlow's record_writer.h). An event is a protobuf message, of which only the step, field 2, is read. Files are untrusted:
 //! sizes are bounded.
 
-use std::io::{BufRead, ErrorKind, Read, Result};
+use std::io::{BufRead, Read, Result};
 
 use protobuf::CodedInputStream;
 use protobuf::wire_format::WireType;
@@ -31,11 +31,9 @@ pub fn length_up_to(mut reader: impl BufRead, last_step: u64) -> Result<u64> {
 
 /// Reads the next event. Returns `None` at the end of the file, or if no whole record follows.
 fn next_event(reader: &mut impl BufRead) -> Result<Option<Vec<u8>>> {
-    let Some(length) = checked(reader, 8)? else {
-        return Ok(None);
-    };
-    match length.try_into().map(u64::from_le_bytes) {
-        Ok(length) if length <= LARGEST => checked(reader, length as usize),
+    let length = checked(reader, 8)?.and_then(|bytes| bytes.try_into().ok());
+    match length.map(u64::from_le_bytes) {
+        Some(length) if length <= LARGEST => checked(reader, length as usize),
         _ => Ok(None),
     }
 }
@@ -43,15 +41,11 @@ fn next_event(reader: &mut impl BufRead) -> Result<Option<Vec<u8>>> {
 /// Reads `count` bytes and their checksum. Returns `None` if they are incomplete or do not match.
 fn checked(reader: &mut impl BufRead, count: usize) -> Result<Option<Vec<u8>>> {
     let mut bytes = Vec::new();
-    let mut checksum = [0; 4];
-    if reader.by_ref().take(count as u64).read_to_end(&mut bytes)? < count {
-        return Ok(None);
-    }
-    match reader.read_exact(&mut checksum) {
-        Err(error) if error.kind() == ErrorKind::UnexpectedEof => Ok(None),
-        result => result
-            .map(|()| (masked_crc32c(&bytes) == u32::from_le_bytes(checksum)).then_some(bytes)),
-    }
+    let mut checksum = Vec::new();
+    reader.by_ref().take(count as u64).read_to_end(&mut bytes)?;
+    reader.take(4).read_to_end(&mut checksum)?;
+    let is_whole = bytes.len() == count && checksum == masked_crc32c(&bytes).to_le_bytes();
+    Ok(is_whole.then_some(bytes))
 }
 
 /// The step of an event, or 0 if it has none, or `None` if it is not a protobuf message.

@@ -3,6 +3,7 @@
 //! A log that cannot be written causes a warning and never ends the training run. Lost iterations are counted, and the log is
 //! opened again at the next checkpoint.
 
+use std::borrow::Borrow;
 use std::ops::Range;
 use std::path::{Path, PathBuf};
 
@@ -30,8 +31,8 @@ pub struct Report {
     metrics: Log<Metrics>,
     /// The settings by dotted key, for TensorBoard's HPARAMS.
     pub hparams: Table,
-    /// The goals of the best evaluation, if there was one.
-    pub best: Option<f64>,
+    /// The goals of the best evaluation, or NaN if there was none.
+    pub best: f64,
     /// The row of TensorBoard's HPARAMS.
     session: Log<EventFile>,
     /// From the iteration before the first one of the run to the last one that was logged.
@@ -94,11 +95,10 @@ impl<W> Log<W> {
 
     /// Ensures that everything is on the disk. Reports if it is not.
     fn sync(&mut self, progress: &StatusLine, sync: impl FnOnce(&mut W) -> Result<()>) {
-        let Some(result) = self.writer.as_mut().map(sync) else {
-            return;
-        };
-        let unsynced = std::mem::take(&mut self.unsynced);
-        result.unwrap_or_else(|error| self.give_up(progress, unsynced, &error));
+        if let Some(result) = self.writer.as_mut().map(sync) {
+            let unsynced = std::mem::take(&mut self.unsynced);
+            result.unwrap_or_else(|error| self.give_up(progress, unsynced, &error));
+        }
     }
 
     /// Stops writing, and counts the iterations that are `lost`. Reports this unless it is known.
@@ -113,20 +113,16 @@ impl<W> Log<W> {
 
 impl Report {
     /// Creates the report of a run in `folder`, for numbers with these names. Writes nothing yet.
-    pub fn new(folder: &Path, names: &[impl AsRef<str>], progress: StatusLine) -> Self {
-        let columns: Vec<&str> = ["iteration", "env_steps"]
-            .into_iter()
-            .chain(names.iter().map(AsRef::as_ref))
-            .collect();
+    pub fn new(folder: &Path, names: &[impl Borrow<str>], progress: StatusLine) -> Self {
         Self {
             folder: folder.to_owned(),
-            header: columns.join(","),
+            header: format!("iteration,env_steps,{}", names.join(",")),
             descriptions: Descriptions::new(),
             settings: String::new(),
             events: Log::new("the event file"),
             metrics: Log::new(METRICS),
             hparams: Table::new(),
-            best: None,
+            best: f64::NAN,
             session: Log::new(HPARAMS),
             iterations: 0..0,
             env_steps: 0,
@@ -200,16 +196,13 @@ impl Report {
         self.metrics
             .write(&self.progress, |metrics| metrics.row(&row));
         if !status.evaluation.is_nan() {
-            let best = self
-                .best
-                .map_or(status.evaluation, |goals| goals.max(status.evaluation));
-            self.best = Some(best);
+            self.best = self.best.max(status.evaluation);
             let drop_rate = values
                 .iter()
                 .find(|(name, _)| name.as_ref() == "eval/drop_rate");
             let drop_rate = drop_rate.map_or(f64::NAN, |(_, value)| *value);
             let metrics = [
-                ("best_goals", best),
+                ("best_goals", self.best),
                 ("drop_rate", drop_rate),
                 ("steps_per_s", status.steps_per_s),
             ];
@@ -230,9 +223,8 @@ impl Report {
 
     /// Says in the row of TensorBoard's HPARAMS that the run has made all its steps, or has failed.
     pub fn end(&mut self, succeeded: bool) {
-        let step = self.env_steps;
         self.session.write(&self.progress, |events| {
-            events.values(hparams::end(succeeded)?, step)
+            events.values(hparams::end(succeeded)?, self.env_steps)
         });
     }
 

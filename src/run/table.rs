@@ -33,6 +33,13 @@ pub struct MetricsTable {
     pub columns: HashMap<String, Vec<f64>>,
 }
 
+impl MetricsTable {
+    /// The values of a column, or none if there is no such column.
+    pub fn column(&self, name: &str) -> &[f64] {
+        self.columns.get(name).map_or(&[], Vec::as_slice)
+    }
+}
+
 /// The table that `place` means: a file, or the table of a run folder.
 pub fn table_of(place: &Path) -> PathBuf {
     if place.is_dir() {
@@ -49,8 +56,11 @@ pub fn table_of(place: &Path) -> PathBuf {
 /// Fails if the file cannot be read, lacks a required column, has too many rows, or contains anything but numbers.
 pub fn read_metrics(place: &Path, required: &[&str], wanted: &[&str]) -> Result<MetricsTable> {
     let path = table_of(place);
-    let odd = place.is_dir() && path.exists() && !path.is_file();
-    ensure!(!odd, "cannot read {}: not a regular file", path.display());
+    ensure!(
+        !place.is_dir() || !path.exists() || path.is_file(),
+        "cannot read {}: not a regular file",
+        path.display()
+    );
     let file = File::open(&path).cannot("read", &path)?.take(LARGEST_TABLE);
     let mut reader = BufReader::with_capacity(1 << 16, file);
     let mut line = Vec::new();
@@ -64,11 +74,11 @@ pub fn read_metrics(place: &Path, required: &[&str], wanted: &[&str]) -> Result<
             shortened(&header)
         );
     }
-    let asked = required
+    let places: Vec<usize> = required
         .iter()
         .chain(wanted)
-        .map(|column| names.iter().position(|name| name == column));
-    let places: Vec<usize> = asked.flatten().collect();
+        .filter_map(|column| names.iter().position(|name| name == column))
+        .collect();
     let columns = read_columns(reader, &path, &places, names.len())?;
     let columns = places
         .iter()
@@ -108,13 +118,11 @@ fn read_columns(
             continue;
         }
         for (column, &place) in columns.iter_mut().zip(places) {
-            let cell = cells[place];
-            column.push(number(cell).with_context(|| {
-                let cell = String::from_utf8_lossy(cell);
+            column.push(number(cells[place]).with_context(|| {
                 format!(
                     "{}, row {row}: not a number: `{}`",
                     path.display(),
-                    shortened(&cell)
+                    shortened(&String::from_utf8_lossy(cells[place]))
                 )
             })?);
         }
@@ -129,11 +137,8 @@ fn number(cell: &[u8]) -> Result<f64> {
     } else {
         str::from_utf8(cell)?.parse()?
     };
-    Ok(if number.abs() <= LARGEST_VALUE {
-        number
-    } else {
-        f64::NAN
-    })
+    let is_drawn = number.abs() <= LARGEST_VALUE;
+    Ok(if is_drawn { number } else { f64::NAN })
 }
 
 /// The value at `x` on the straight lines between `points`, or `None` outside of them.

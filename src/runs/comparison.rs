@@ -1,7 +1,9 @@
 //! Two runs beside each other: the settings in which they differ, and their figures at equal steps.
 
+use std::iter;
+
 use anyhow::{Context, Result};
-use serde_json::{Map, Value, json};
+use serde_json::{Value, json};
 
 use super::found::Run;
 use crate::config::{Difference, short};
@@ -41,7 +43,7 @@ impl Comparison {
         let mut begin = f64::NEG_INFINITY;
         let row = |step| {
             let figures = std::array::from_fn(|figure| {
-                [&curves[0], &curves[1]].map(|of| match COMPARED[figure] {
+                curves.each_ref().map(|of| match COMPARED[figure] {
                     ("eval", _) => value_at(&of[figure], step).unwrap_or(f64::NAN),
                     // The others are logged in every iteration.
                     _ => mean_between(&of[figure], begin, step),
@@ -50,53 +52,37 @@ impl Comparison {
             begin = step;
             (step, figures)
         };
-        let rows = marks(&curves).into_iter().map(row).collect();
         Ok(Self {
             settings: configs.map(|(a, b)| a.compared_with(b)),
-            rows,
+            rows: marks(&curves).into_iter().map(row).collect(),
         })
     }
 
     /// The lines that follow the table of both runs.
     pub fn lines(&self) -> Vec<String> {
-        let words = |words: &[&str]| {
-            words
-                .iter()
-                .map(|word| (*word).to_owned())
-                .collect::<Vec<String>>()
-        };
         let settings = match self.settings.as_deref() {
-            None => vec![words(&["the settings of one run are not known"])],
-            Some([]) => vec![words(&["the settings are the same"])],
+            None => vec![vec!["the settings of one run are not known".into()]],
+            Some([]) => vec![vec!["the settings are the same".into()]],
             Some(all) => {
-                let row = |(key, both): &Difference| {
-                    [key.clone()]
-                        .into_iter()
-                        .chain(both.iter().map(short))
-                        .collect()
-                };
-                [words(&["setting", "A", "B"])]
-                    .into_iter()
-                    .chain(all.iter().map(row))
-                    .collect()
+                let heads = ["setting", "A", "B"].map(String::from);
+                let rows = all.iter().map(|(key, [a, b])| {
+                    [key.clone(), short(a), short(b)].map(|cell| harmless(&cell))
+                });
+                iter::chain([heads], rows).map(Vec::from).collect()
             }
         };
-        let settings = settings
-            .into_iter()
-            .map(|row| row.iter().map(|cell| harmless(cell)).collect());
-        let settings: Vec<Vec<String>> = settings.collect();
         let heads = COMPARED
             .iter()
             .flat_map(|(_, column)| [format!("{column} A"), "B".to_owned()]);
-        let heads = ["steps".to_owned()].into_iter().chain(heads).collect();
+        let heads = iter::chain(["steps".to_owned()], heads).collect();
         let figures = self.rows.iter().map(|(step, figures)| {
             let cells = figures.iter().flatten().map(|value| number(*value, 2));
-            [format!("{step:.0}")].into_iter().chain(cells).collect()
+            iter::chain([format!("{step:.0}")], cells).collect()
         });
         let figures = if self.rows.is_empty() {
             vec!["the evaluations of the two runs do not overlap in steps".into()]
         } else {
-            aligned(&[heads].into_iter().chain(figures).collect::<Vec<_>>(), 0)
+            aligned(&Vec::from_iter(iter::chain([heads], figures)), 0)
         };
         [
             vec![String::new()],
@@ -108,23 +94,22 @@ impl Comparison {
     }
 
     /// Its object of JSON, with these objects of both runs.
-    pub fn as_json(&self, runs: &[Value]) -> Value {
+    pub fn as_json(&self, runs: Value) -> Value {
         let settings = self.settings.as_ref().map(|all| {
-            let both = all.iter().map(|(key, both)| (key.clone(), json!(both)));
-            both.collect::<Map<String, Value>>()
+            let all = all.iter().map(|(key, both)| (key.clone(), json!(both)));
+            Value::from_iter(all)
         });
-        let row = |(step, figures): &(f64, [[f64; 2]; COMPARED.len()])| {
-            let figures = COMPARED
-                .iter()
-                .zip(figures)
-                .map(|((_, column), both)| ((*column).to_owned(), json!(both)));
-            let steps = ("env_steps".to_owned(), json!(*step as u64));
-            Value::Object([steps].into_iter().chain(figures).collect())
-        };
+        let rows = self.rows.iter().map(|(step, figures)| {
+            let mut row = json!({ "env_steps": *step as u64 });
+            for ((_, column), both) in COMPARED.iter().zip(figures) {
+                row[column] = json!(both);
+            }
+            row
+        });
         json!({
             "runs": runs,
             "settings": settings,
-            "at_equal_steps": self.rows.iter().map(row).collect::<Vec<Value>>(),
+            "at_equal_steps": Value::from_iter(rows),
         })
     }
 }
@@ -137,15 +122,12 @@ fn curves(run: &Run) -> Result<Curves> {
     let columns = COMPARED.map(|(group, column)| format!("{group}/{column}"));
     let wanted = columns.each_ref().map(String::as_str);
     let table = read_metrics(&run.path, &["env_steps"], &wanted).context("cannot compare")?;
-    let steps = &table.columns["env_steps"];
+    let steps = table.column("env_steps").iter();
     Ok(columns.map(|column| {
-        let values = table.columns.get(&column).map_or(&[][..], |values| values);
-        let points = steps
-            .iter()
-            .zip(values)
-            .map(|(step, value)| [*step, *value]);
+        let values = steps.clone().zip(table.column(&column));
+        let points = values.map(|(step, value)| [*step, *value]);
         points
-            .filter(|point| point.iter().all(|x| !x.is_nan()))
+            .filter(|[step, value]| !step.is_nan() && !value.is_nan())
             .collect()
     }))
 }

@@ -4,9 +4,9 @@ use std::path::{Path, PathBuf};
 use std::time::{Duration, SystemTime};
 
 use anyhow::Result;
-use serde_json::{Map, Value, json};
+use serde_json::{Value, json};
 
-use crate::config::{Config, Difference, Settings, Source, short};
+use crate::config::{Config, Difference, Source, short};
 use crate::os::{self, Hold, Stamp, clock, harmless, number, steps_of_all};
 use crate::run::{Glance, read_metrics};
 
@@ -65,48 +65,41 @@ impl Run {
         path: &Path,
         glance: &Glance,
         default: &Config,
-        known: Option<&&Figures>,
+        known: Option<&Figures>,
         now: SystemTime,
     ) -> Self {
-        let config = glance.config.as_ref().map(|path| {
-            Settings::new()
-                .file(Source::new(path, os::read_text(path)?))
-                .resolve()
+        let read = |path: &PathBuf| Source::new(path, os::read_text(path)?).resolve();
+        let mut problems = Vec::new();
+        let config = glance.config.as_ref().and_then(|path| {
+            let unfit =
+                |error| problems.push(format!("config.toml does not fit this version: {error:#}"));
+            read(path).map_err(unfit).ok()
         });
-        let (config, problem) = match config.transpose() {
-            Ok(config) => (config, None),
-            Err(error) => (
-                None,
-                Some(format!("config.toml does not fit this version: {error:#}")),
-            ),
-        };
         let stamp = glance.metrics.as_deref().and_then(os::stamp);
         let figures = match known.filter(|known| known.stamp == stamp) {
-            Some(known) => (*known).clone(),
-            None => Figures {
-                stamp,
-                ..Figures::of(path, glance.metrics.is_some())
-            },
+            Some(known) => known.clone(),
+            None => Figures::of(path, stamp),
         };
+        problems.extend(figures.problem.clone());
         let total_steps = config.as_ref().map(|config| config.run.total_steps);
         // A run that waits for evaluations to rise may end before, and its mark says so.
-        let needed = config
+        let ends_early = config
             .as_ref()
-            .filter(|config| config.run.patience == 0)
-            .and(total_steps);
+            .is_some_and(|config| config.run.patience > 0);
+        let needed = total_steps.filter(|_| !ends_early);
         let whole = path.canonicalize().unwrap_or_else(|_| path.to_owned());
         Self {
             name: whole
                 .file_name()
                 .unwrap_or(whole.as_os_str())
-                .to_string_lossy()
-                .into_owned(),
+                .display()
+                .to_string(),
             state: RunState::of(glance, figures.env_steps, needed, now),
             total_steps,
             changed: config
                 .as_ref()
                 .map_or(Vec::new(), |config| default.compared_with(config)),
-            problems: problem.into_iter().chain(figures.problem.clone()).collect(),
+            problems,
             path: path.to_owned(),
             figures,
             config,
@@ -139,20 +132,14 @@ impl Run {
             (Some(made), None) => made.to_string(),
             (None, _) => "-".into(),
         };
+        let changed = self.changed.iter();
         let settings = match (&self.problems[..], &self.config) {
             ([], None) => "no config.toml".into(),
-            ([], _) => self
-                .changed
-                .iter()
-                .map(|(key, [_, own])| format!("{key}={}", short(own)))
-                .collect::<Vec<_>>()
-                .join(" "),
-            (problems, _) => problems
-                .join("; ")
-                .lines()
-                .map(str::trim)
-                .collect::<Vec<_>>()
-                .join(" "),
+            ([], _) => {
+                let changed = changed.map(|(key, [_, own])| format!("{key}={}", short(own)));
+                Vec::from_iter(changed).join(" ")
+            }
+            (problems, _) => Vec::from_iter(problems.join("; ").lines().map(str::trim)).join(" "),
         };
         let name = match self.name.char_indices().nth(LONGEST_NAME) {
             Some((end, _)) => format!("{}…", &self.name[..end]),
@@ -172,10 +159,10 @@ impl Run {
 
     /// Its object of JSON.
     pub fn as_json(&self) -> Value {
-        let changed = self
-            .changed
-            .iter()
-            .map(|(key, [_, own])| (key.clone(), json!(own)));
+        let changed = self.config.as_ref().map(|_| {
+            let changed = self.changed.iter();
+            Value::from_iter(changed.map(|(key, [_, own])| (key.clone(), json!(own))))
+        });
         let Figures {
             env_steps,
             steps_per_s,
@@ -193,7 +180,7 @@ impl Run {
             "steps_per_s": steps_per_s,
             "goals": goals,
             "best_goals": best_goals,
-            "changed": self.config.is_some().then(|| changed.collect::<Map<String, Value>>()),
+            "changed": changed,
             "problems": self.problems,
         })
     }
@@ -201,37 +188,33 @@ impl Run {
 
 impl Figures {
     /// Reads the table of a run, if it has one.
-    fn of(run: &Path, has_table: bool) -> Self {
+    fn of(run: &Path, stamp: Option<Stamp>) -> Self {
         let unknown = f64::NAN;
         let none = Self {
-            stamp: None,
+            stamp,
             env_steps: None,
             steps_per_s: unknown,
             goals: unknown,
             best_goals: unknown,
             problem: None,
         };
-        if !has_table {
+        if stamp.is_none() {
             return none;
         }
         let read = || -> Result<Self> {
             let names = ["env_steps", "time/steps_per_s", "eval/goals"];
             let table = read_metrics(run, &names[..1], &names[1..])?;
-            let [steps, speeds, goals] =
-                names.map(|name| table.columns.get(name).map_or(&[][..], |values| values));
+            let [steps, speeds, goals] = names.map(|name| table.column(name));
             let known = |values: &[f64]| {
-                values
-                    .iter()
-                    .copied()
-                    .filter(|value| !value.is_nan())
-                    .collect::<Vec<f64>>()
+                let values = values.iter().copied();
+                Vec::from_iter(values.filter(|value| !value.is_nan()))
             };
             let speeds = known(&speeds[speeds.len().saturating_sub(LAST)..]);
             let goals = known(goals);
             Ok(Self {
                 env_steps: Some(steps.last().map_or(0, |steps| *steps as u64)),
                 steps_per_s: speeds.iter().sum::<f64>() / speeds.len() as f64,
-                goals: goals.last().copied().unwrap_or(unknown),
+                goals: *goals.last().unwrap_or(&unknown),
                 best_goals: goals.into_iter().fold(unknown, f64::max),
                 ..none.clone()
             })
@@ -252,16 +235,14 @@ impl RunState {
         now: SystemTime,
     ) -> Self {
         let all = env_steps.zip(total_steps).map(|(made, all)| made >= all);
-        let age = glance
-            .logged
-            .map(|logged| now.duration_since(logged).unwrap_or_default());
+        let is_silent = |logged| now.duration_since(logged).unwrap_or_default() >= SILENT;
         // One that could not save its end has neither the mark nor released its lock.
         let has_ended = glance.is_marked || glance.hold == Hold::Released;
         match glance.hold {
             Hold::Held => Self::Training,
             _ if has_ended && all.unwrap_or(glance.is_marked) => Self::Finished,
             _ if glance.is_marked => Self::Stopped,
-            Hold::Elsewhere if age.is_some_and(|age| age < SILENT) => Self::Training,
+            Hold::Elsewhere if !glance.logged.is_none_or(is_silent) => Self::Training,
             Hold::Released => Self::Stopped,
             Hold::Left | Hold::Elsewhere => Self::Failed,
         }

@@ -3,21 +3,20 @@
 mod comparison;
 mod found;
 
-use std::collections::HashMap;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::thread;
 use std::time::{Duration, SystemTime};
 
-use anyhow::{Context, Result, ensure};
+use anyhow::{Result, ensure};
 use rayon::prelude::*;
-use serde_json::{Value, json};
+use serde_json::Value;
 
 use crate::cli::RunsArgs;
 use crate::config::Config;
 use crate::os::{self, Screen, aligned, text_of};
 use crate::run::{self, Glance};
 use comparison::Comparison;
-use found::{Figures, Run};
+use found::Run;
 
 /// The time between two tables of `--watch`.
 const EVERY: Duration = Duration::from_secs(5);
@@ -51,19 +50,17 @@ pub fn runs(args: &RunsArgs) -> Result<()> {
             _ => None,
         };
         if args.json {
-            let all: Vec<Value> = runs.iter().map(Run::as_json).collect();
-            let text = compared.map_or_else(|| json!(all), |compared| compared.as_json(&all));
-            return os::print(&(os::harmless(&text.to_string()) + "\n"));
+            let all: Value = runs.iter().map(Run::as_json).collect();
+            let shown = match compared {
+                Some(compared) => compared.as_json(all),
+                None => all,
+            };
+            return os::print(&(os::harmless(&shown.to_string()) + "\n"));
         }
         if runs.is_empty() && !args.watch {
             os::say!("there are no runs in this folder");
         }
-        let letters = if compared.is_some() {
-            &["A", "B"][..]
-        } else {
-            &[]
-        };
-        let mut lines = table(&runs, letters);
+        let mut lines = table(&runs, compared.is_some());
         lines.extend(compared.iter().flat_map(Comparison::lines));
         if !args.watch {
             return os::print(&text_of(&lines));
@@ -79,62 +76,46 @@ pub fn runs(args: &RunsArgs) -> Result<()> {
 /// Reads the runs at the places of `args`: one folder of runs, or runs themselves. Runs of a folder come newest first. A table that
 /// has not changed since it was read `before` is not read again.
 fn read(args: &RunsArgs, default: &Config, before: &[Run]) -> Result<Vec<Run>> {
-    let seen = |path: PathBuf| Glance::of(&path).map(|glance| (path, glance));
     let places = &args.places;
-    let all = |folder| -> Result<Vec<_>> {
-        Ok(run::folders_of_runs(folder, args.watch)?
-            .into_iter()
-            .filter_map(seen)
-            .collect())
-    };
-    let mut found: Vec<(PathBuf, Glance)> = match &places[..] {
-        [] => all(None)?,
-        [place] if Glance::of(place).is_none() => all(Some(place))?,
-        places => {
-            let runs = places
-                .iter()
-                .filter(|place| !args.watch || Glance::of(place).is_some())
-                .map(|place| {
-                    ensure!(place.exists(), "{}: no such folder", place.display());
-                    let no_run = || {
-                        format!(
-                            "{} holds no run; to list a folder of runs, name it alone",
-                            place.display()
-                        )
-                    };
-                    seen(place.clone()).with_context(no_run)
-                });
-            runs.collect::<Result<_>>()?
+    let (paths, are_runs) = match &places[..] {
+        [] => (run::folders_of_runs(None, args.watch)?, false),
+        [place] if Glance::of(place).is_none() => {
+            (run::folders_of_runs(Some(place), args.watch)?, false)
         }
+        places => (places.to_vec(), !args.watch),
     };
+    let mut found = Vec::new();
+    for path in paths {
+        let glance = Glance::of(&path);
+        if are_runs {
+            ensure!(path.exists(), "{}: no such folder", path.display());
+            ensure!(
+                glance.is_some(),
+                "{} holds no run; to list a folder of runs, name it alone",
+                path.display()
+            );
+        }
+        found.extend(glance.map(|glance| (path, glance)));
+    }
     if places.len() < 2 {
         found.sort_by(|(a, of_a), (b, of_b)| (of_b.begun, b).cmp(&(of_a.begun, a)));
     }
-    let known: HashMap<&Path, &Figures> = before
-        .iter()
-        .map(|run| (&*run.path, &run.figures))
-        .collect();
     let now = SystemTime::now();
-    Ok(found
-        .into_par_iter()
-        .map(|(path, glance)| Run::of(&path, &glance, default, known.get(&*path), now))
-        .collect())
+    let of = |(path, glance): (PathBuf, Glance)| {
+        let known = before.iter().find(|run| run.path == path);
+        Run::of(&path, &glance, default, known.map(|run| &run.figures), now)
+    };
+    Ok(found.into_par_iter().map(of).collect())
 }
 
-/// The runs as lines, each with its letter if they have some.
-fn table(runs: &[Run], letters: &[&str]) -> Vec<String> {
-    let heads = HEADS.map(String::from).to_vec();
-    let rows = [heads].into_iter().chain(runs.iter().map(Run::cells));
-    let marks = [""]
-        .iter()
-        .chain(letters)
-        .map(|letter| vec![(*letter).to_owned()]);
-    let rows: Vec<Vec<String>> = match letters.len() {
-        0 => rows.collect(),
-        _ => marks
-            .zip(rows)
-            .map(|(mark, row)| [mark, row].concat())
-            .collect(),
-    };
-    aligned(&rows, WORDS + usize::from(!letters.is_empty()))
+/// The runs as lines. Two that are compared have letters.
+fn table(runs: &[Run], compared: bool) -> Vec<String> {
+    let mut rows = vec![HEADS.map(String::from).to_vec()];
+    rows.extend(runs.iter().map(Run::cells));
+    if compared {
+        for (row, letter) in rows.iter_mut().zip(["", "A", "B"]) {
+            row.insert(0, letter.into());
+        }
+    }
+    aligned(&rows, WORDS + usize::from(compared))
 }

@@ -24,10 +24,9 @@ impl Clock {
 
     /// The steps since the last call, at this multiple of real time.
     pub fn steps_due(&mut self, speed: f64) -> u32 {
-        let passed = self.last.elapsed().as_secs_f64();
+        let most = (LARGEST_LAG * speed.max(1.0)).max(self.ctrl_dt);
+        self.owed = most.min(self.owed + self.last.elapsed().as_secs_f64() * speed);
         self.last = Instant::now();
-        self.owed =
-            (self.owed + passed * speed).min((LARGEST_LAG * speed.max(1.0)).max(self.ctrl_dt));
         let steps = (self.owed / self.ctrl_dt).floor();
         self.owed -= steps * self.ctrl_dt;
         steps as u32

@@ -97,11 +97,9 @@ impl Columns {
     pub fn of_record(&self, record: &Value) -> Result<Vec<f64>> {
         let number = |value: &Value| value.as_f64().filter(|x| x.abs() < LARGEST);
         let list = |key: &str, length: usize| {
-            let found: Option<Vec<f64>> = record[key]
-                .as_array()
-                .and_then(|list| list.iter().map(number).collect());
-            let fits = found.filter(|found| found.len() == length);
-            fits.with_context(|| {
+            let list = record[key].as_array().filter(|list| list.len() == length);
+            let numbers: Option<Vec<f64>> = list.and_then(|list| list.iter().map(number).collect());
+            numbers.with_context(|| {
                 format!("`{key}` is not a list of {length} numbers, as in this scene")
             })
         };
@@ -112,12 +110,10 @@ impl Columns {
             found => found.with_context(|| format!("`{what}` is not a number")),
         };
         let count = |key: &str| {
-            let count = if is_reset && key != "step" {
-                Some(0)
-            } else {
-                record[key].as_u64()
-            };
-            let count = count.filter(|count| *count <= MOST.into());
+            if is_reset && key != "step" {
+                return Ok(0.0);
+            }
+            let count = record[key].as_u64().filter(|count| *count <= MOST.into());
             count
                 .map(|count| count as f64)
                 .with_context(|| format!("`{key}` is not a count up to {MOST}"))
@@ -152,11 +148,8 @@ impl Columns {
         row.extend(scalars.iter().chain(reward));
         // The physics of the last step of an episode may have diverged.
         for (place, x) in row.iter_mut().enumerate() {
-            let most = if place < self.poses() {
-                FARTHEST
-            } else {
-                LARGEST
-            };
+            let is_pose = place < self.poses();
+            let most = if is_pose { FARTHEST } else { LARGEST };
             *x = if x.is_nan() {
                 0.0
             } else {
@@ -204,21 +197,14 @@ impl Columns {
         for (key, value) in more.as_object().into_iter().flatten() {
             meta[key] = value.clone();
         }
-        let counts = [0, 2, 3].map(|scalar| self.poses() + scalar).to_vec();
-        let Drawing {
-            scene,
-            start,
-            meshes,
-            ..
-        } = &mut self.drawing;
-        let mut scene = scene.take();
-        scene["start"] = json!(start);
+        let mut scene = self.drawing.scene.take();
+        scene["start"] = json!(self.drawing.start);
         Page {
             meta,
             scene,
-            meshes: std::mem::take(meshes),
+            meshes: std::mem::take(&mut self.drawing.meshes),
             rows,
-            counts,
+            counts: [0, 2, 3].map(|scalar| self.poses() + scalar).to_vec(),
         }
     }
 }

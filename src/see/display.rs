@@ -35,10 +35,11 @@ pub fn task_for_display(task: &Task, look: &Look) -> Result<Arc<Task>> {
         dress: prefix.and_then(meshes),
         ..look.clone()
     };
-    let shown = task.for_display(&dressed);
-    match &shown {
-        Err(error) if dressed.dress.is_some() => note(error),
-        _ => return shown,
+    match task.for_display(&dressed) {
+        Err(error) if dressed.dress.is_some() => {
+            note(&error);
+            task.for_display(look)
+        }
+        shown => shown,
     }
-    task.for_display(look)
 }

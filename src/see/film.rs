@@ -42,14 +42,13 @@ impl Film {
                 longest: all as usize,
             },
         )?;
-        let bar = progress_bar(all, "frames", "film");
         Ok(Self {
             renderer,
             writer,
             fps,
             longest,
             drawn: 0,
-            bar,
+            bar: progress_bar(all, "frames", "film"),
         })
     }
 
@@ -142,7 +141,6 @@ pub fn screenshot(
         }
     }
     let size = renderer.size();
-    let picture = renderer.draw(&player.lane.env.sim)?;
-    write_png(output, size, picture)?;
+    write_png(output, size, renderer.draw(&player.lane.env.sim)?)?;
     Ok(size)
 }

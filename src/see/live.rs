@@ -24,14 +24,11 @@ const BETWEEN_ROWS: f64 = 0.02;
 /// The time between two looks at the clock.
 const TICK: Duration = Duration::from_millis(5);
 
-/// Takes one step of an episode, and returns its end if there is one.
-type Stepping = dyn Fn(&mut Player) -> Option<End>;
-
 /// Who acts in an episode.
 #[derive(Clone)]
 pub struct LiveActor {
-    /// Takes one step.
-    pub step: Rc<Stepping>,
+    /// Takes one step of an episode, and returns its end if there is one.
+    pub step: Rc<dyn Fn(&mut Player) -> Option<End>>,
     /// The page's name for the policy, if it differs from the name for the whole page.
     pub policy: Option<String>,
     /// The task that it acts in.
@@ -200,15 +197,14 @@ impl LiveHand {
     }
 
     fn step(&mut self) {
-        let end = (self.acting.step)(&mut self.player);
-        self.has_ended = end.is_some();
+        self.has_ended = (self.acting.step)(&mut self.player).is_some();
         add(&mut self.reward, self.player.lane.env.last.reward);
     }
 }
 
 /// The first event for a viewer: the key of the page, and what is under way.
 fn hello(key: &str, hands: &[LiveHand], sliders: Option<&Sliders>) -> String {
-    let episodes: Vec<&Value> = hands.iter().map(|hand| &hand.about).collect();
+    let episodes: Value = hands.iter().map(|hand| hand.about.clone()).collect();
     let mut hello = json!({ "key": key, "episodes": episodes });
     if let Some(sliders) = sliders {
         hello["controls"] = sliders.values();

@@ -58,15 +58,8 @@ impl Replay {
     /// Records a moment of an episode.
     pub fn observe(&mut self, moment: &Moment) {
         let last = &moment.env.last;
-        let begins = moment.step.is_none();
-        let row = self.columns.of(
-            moment.env,
-            if begins {
-                TaskReward::default()
-            } else {
-                last.reward
-            },
-        );
+        let reward = moment.step.map_or(TaskReward::default(), |_| last.reward);
+        let row = self.columns.of(moment.env, reward);
         let end = moment.step.and_then(|(_, end)| end).map(|end| match end {
             End::Terminated if last.diverged => "diverged",
             End::Terminated => "terminated",

@@ -29,7 +29,8 @@ struct Slider {
 
 impl Slider {
     fn value(&self) -> f64 {
-        self.value.unwrap_or((self.range[0] + self.range[1]) / 2.0)
+        let [low, high] = self.range;
+        self.value.unwrap_or(f64::midpoint(low, high))
     }
 }
 
@@ -37,16 +38,17 @@ impl Sliders {
     /// Creates a slider for each actuator of a task's hand.
     pub fn new(task: &Task) -> Self {
         let hand = &task.hand;
-        let sliders = hand.parts.actuators.iter().zip(&hand.actuators);
-        let sliders = sliders.map(|(name, actuator)| Slider {
+        let actuators = hand.parts.actuators.iter().zip(&hand.actuators);
+        let sliders = actuators.map(|(name, actuator)| Slider {
             name: name.clone(),
             range: actuator.range,
             value: None,
         });
-        Self(Arc::new(Mutex::new(SliderStates {
+        let state = SliderStates {
             sliders: sliders.collect(),
             moved: false,
-        })))
+        };
+        Self(Arc::new(state.into()))
     }
 
     /// Changes an action to what the sliders ask for: -1 and 1 are the ends of the range of an actuator.
@@ -65,15 +67,17 @@ impl Sliders {
         Box::new(move |body| {
             let moves: Vec<(usize, f64)> = serde_json::from_slice(body).map_err(|_| MALFORMED)?;
             let mut state = own.state();
-            let sound = |(actuator, value): &(usize, f64)| {
-                *actuator < state.sliders.len() && value.is_finite()
-            };
-            if !moves.iter().all(sound) {
+            let count = state.sliders.len();
+            if moves
+                .iter()
+                .any(|(actuator, value)| *actuator >= count || !value.is_finite())
+            {
                 return Err(MALFORMED);
             }
             for (actuator, value) in moves {
                 let slider = &mut state.sliders[actuator];
-                slider.value = Some(value.max(slider.range[0]).min(slider.range[1]));
+                let [low, high] = slider.range;
+                slider.value = Some(value.max(low).min(high));
                 state.moved = true;
             }
             Ok(())

@@ -47,11 +47,10 @@ impl<'a> Window<'a> {
     pub fn play(mut self, task: &Arc<Task>, episodes: Episodes) -> Result<String> {
         let mut player = Player::new(task, episodes);
         let mut tally = Tally::default();
-        let level = Some(task.config.success_tolerance.to_degrees());
         let mut curves = [
             Trend {
                 name: "rotation error, degrees (line: tolerance)",
-                level,
+                level: Some(task.config.success_tolerance.to_degrees()),
                 ..Trend::default()
             },
             Trend {
@@ -71,12 +70,8 @@ impl<'a> Window<'a> {
         };
         while self.viewer.is_open() {
             let frame = Instant::now();
-            let readout = readout(
-                &player.lane.env,
-                episodes.first + tally.episodes,
-                &tally,
-                &curves,
-            );
+            let episode = episodes.first + tally.episodes;
+            let readout = readout(&player.lane.env, episode, &tally, &curves);
             let asked = self.viewer.show(&mut player.lane.env.sim, readout)?;
             if asked.reset && !next(&mut player, &mut tally, false) {
                 return Ok(tally.summary());
@@ -84,12 +79,11 @@ impl<'a> Window<'a> {
             if asked.new_goal {
                 player.new_goal();
             }
-            let due = match asked.paused {
-                true => {
-                    clock.pause();
-                    asked.steps
-                }
-                false => clock.steps_due(asked.speed),
+            let due = if asked.paused {
+                clock.pause();
+                asked.steps
+            } else {
+                clock.steps_due(asked.speed)
             };
             for _ in 0..due {
                 let end = player.step(&self.actors[asked.choice]);
@@ -129,31 +123,21 @@ impl Tally {
     }
 
     fn summary(&self) -> String {
-        let Self {
-            steps,
-            completed,
-            drops,
-            goals,
-            ..
-        } = self;
         format!(
-            "shown: {steps} steps, {completed} episodes completed, {drops} drops, {goals} goals reached"
+            "shown: {} steps, {} episodes completed, {} drops, {} goals reached",
+            self.steps, self.completed, self.drops, self.goals
         )
     }
 }
 
 /// Adds the last of so many steps to the curves of the error and the reward.
 fn extend(curves: &mut [Trend; 2], env: &Repose, steps: u64) {
-    let step = &env.last;
-    for (curve, value) in curves
-        .iter_mut()
-        .zip([step.rot_dist.to_degrees(), step.reward.iter().sum()])
-    {
-        curve
-            .points
-            .push_back([steps as f64 * env.task.config.ctrl_dt, value]);
-        if curve.points.len() > HISTORY {
-            curve.points.pop_front();
+    let time = steps as f64 * env.task.config.ctrl_dt;
+    let values = [env.last.rot_dist.to_degrees(), env.last.reward.iter().sum()];
+    for (Trend { points, .. }, value) in curves.iter_mut().zip(values) {
+        points.push_back([time, value]);
+        if points.len() > HISTORY {
+            points.pop_front();
         }
     }
 }
@@ -174,25 +158,20 @@ fn readout(env: &Repose, episode: usize, tally: &Tally, curves: &[Trend]) -> Rea
         ..Step::default()
     };
     let largest = task_reward(config, &extreme);
-    let terms = named(task_terms(), reward)
-        .zip(largest)
-        .map(|((name, value), largest)| {
-            let fraction = if largest == 0.0 {
-                0.0
-            } else {
-                (value / largest.abs()) as f32
-            };
-            Gauge {
-                name,
-                fraction,
-                signed: true,
-                text: format!("{value:+.3}"),
-            }
-        });
-    let fraction = env.held as f32 / asked as f32;
+    let terms = named(task_terms(), reward).zip(largest);
+    let terms = terms.map(|((name, value), largest)| Gauge {
+        name,
+        fraction: if largest == 0.0 {
+            0.0
+        } else {
+            (value / largest.abs()) as f32
+        },
+        signed: true,
+        text: format!("{value:+.3}"),
+    });
     let hold = Gauge {
         name: "held",
-        fraction,
+        fraction: env.held as f32 / asked as f32,
         signed: false,
         text: format!("{} of {asked} steps", env.held),
     };

@@ -77,7 +77,7 @@ impl Lead {
         report.descriptions = described(&tags);
         report.settings = config.to_text();
         report.hparams = config.dotted();
-        report.best = session.best.map(|[goals, _]| goals);
+        report.best = session.best.map_or(f64::NAN, |[goals, _]| goals);
         Self {
             report,
             saver,
@@ -297,9 +297,9 @@ fn say_what_next(run: &Path, env: &EnvConfig) {
         .parent()
         .filter(|all| !all.as_os_str().is_empty())
         .unwrap_or(Path::new("."));
-    let play = format!("{program} play --ckpt {word}{}", scene_option(env));
     say!(
-        "  {play}\n  {program} plot {word}\n  tensorboard --logdir {}",
+        "  {program} play --ckpt {word}{}\n  {program} plot {word}\n  tensorboard --logdir {}",
+        scene_option(env),
         os::quoted_path(all)
     );
 }

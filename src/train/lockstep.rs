@@ -6,7 +6,6 @@ use anyhow::{Result, bail};
 use serde::{Deserialize, Serialize};
 
 use super::session::Session;
-use crate::env::Member;
 use crate::os::Requests;
 
 /// Why a run ends before all its steps are made.
@@ -16,16 +15,6 @@ pub struct Stop {
     pub by_file: bool,
     /// The signal that has asked for it, or 0.
     pub signal: i32,
-}
-
-impl Stop {
-    /// The stop that these requests ask for.
-    pub fn by_signal(requests: &Requests) -> Self {
-        Self {
-            by_file: false,
-            signal: requests.signal(),
-        }
-    }
 }
 
 /// What follows an iteration.
@@ -59,20 +48,17 @@ impl Session {
         let exchange = &self.agent.exchange;
         // With a single rank, the next iteration stops at once.
         let asked = !exchange.is_alone() && requests.stop.load(Ordering::Relaxed);
-        let weights = if exchange.is_alone() {
-            0
-        } else {
-            self.agent.ppo.checksum()
-        };
-        let signal = if asked { requests.signal() } else { 0 };
-        let vote = Vote {
+        let votes = exchange.all_gather(Vote {
             stop: by_file || asked,
             save: requests.take_save(),
             improved,
-            signal,
-            weights,
-        };
-        let votes = exchange.all_gather(vote);
+            signal: if asked { requests.signal() } else { 0 },
+            weights: if exchange.is_alone() {
+                0
+            } else {
+                self.agent.ppo.checksum()
+            },
+        });
         if let Some(rank) = votes
             .iter()
             .position(|vote| vote.weights != votes[0].weights)
@@ -91,10 +77,9 @@ impl Session {
                 .iteration
                 .is_multiple_of(self.config.run.checkpoint_every);
         let is_last = finished || stop.is_some();
-        let hand_over = exchange.is_alone() || is_last || save || any(|vote| vote.improved);
         Ok(Decision {
             save: save && !is_last,
-            hand_over,
+            hand_over: exchange.is_alone() || is_last || save || any(|vote| vote.improved),
             stop,
         })
     }
@@ -105,18 +90,13 @@ impl Session {
             return Vec::new();
         }
         let iteration = self.agent.iteration;
-        let mut own: Vec<(String, String)> = Vec::new();
-        for Member {
-            env: hand,
-            number: env,
-            ..
-        } in self.agent.pool.members_mut()
-        {
-            let Some(diverged) = hand.diverged.take() else {
-                continue;
-            };
-            let text = diverged.as_json(&self.config.env, iteration, *env);
-            own.push((format!("iteration-{iteration:08}-env-{env}.json"), text));
+        let mut own = Vec::new();
+        for member in self.agent.pool.members_mut() {
+            if let Some(diverged) = member.env.diverged.take() {
+                let text = diverged.as_json(&self.config.env, iteration, member.number);
+                let name = format!("iteration-{iteration:08}-env-{}.json", member.number);
+                own.push((name, text));
+            }
         }
         self.agent.exchange.all_gather(own).concat()
     }

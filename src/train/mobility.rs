@@ -31,10 +31,10 @@ pub fn mobility(task: &Arc<Task>, default: &EnvConfig) -> String {
     let (turned, steps, drops) =
         played.reduce(|| (0.0, 0, 0), |a, b| (a.0 + b.0, a.1 + b.1, a.2 + b.2));
     let rate = 100.0 * turned / f64::from(steps.max(1));
-    let object = &task.hand.parts.object;
     format!(
-        "random actions turn `{object}` by {rate:.2} rad in 100 steps (the built-in hand: {OF_BUILTIN}), and drop it in {drops} of \
-         {EPISODES} episodes; docs/HANDS.md says how to raise the turning rate"
+        "random actions turn `{}` by {rate:.2} rad in 100 steps (the built-in hand: {OF_BUILTIN}), and drop it in {drops} of \
+         {EPISODES} episodes; docs/HANDS.md says how to raise the turning rate",
+        task.hand.parts.object
     )
 }
 

@@ -68,16 +68,15 @@ fn lead(args: &TrainArgs, requests: &Requests, exchange: &Exchange) -> Result<Ex
     session.task.say_warnings();
     if !args.quiet {
         let default = Config::default();
-        let hints = hints(&session.config, args, &default, session.task.scene.size());
-        let own_scene = session.config.env.model_file().is_some() && args.resume.is_none();
-        let mobility = own_scene.then(|| mobility(&session.task, &default.env));
-        session
-            .task
-            .notes()
-            .iter()
-            .chain(&mobility)
-            .chain(&hints)
-            .for_each(|hint| say!("note: {hint}"));
+        let mut notes = session.task.notes();
+        if session.config.env.model_file().is_some() && args.resume.is_none() {
+            notes.push(mobility(&session.task, &default.env));
+        }
+        let size = session.task.scene.size();
+        notes.extend(hints(&session.config, args, &default, size));
+        for note in notes {
+            say!("note: {note}");
+        }
     }
     let mut lead = Lead::new(&session, saver, args.quiet);
     if args.resume.is_none() {
@@ -104,12 +103,16 @@ fn run(
     duties: &mut dyn Duties,
     requests: &Requests,
 ) -> Result<Option<Stop>> {
+    let by_signal = || Stop {
+        by_file: false,
+        signal: requests.signal(),
+    };
     if !session.begin(requests, duties)? {
-        return Ok(Some(Stop::by_signal(requests)));
+        return Ok(Some(by_signal()));
     }
     while !session.finished() {
         let Some(outcome) = session.iterate(requests, duties)? else {
-            return Ok(Some(Stop::by_signal(requests)));
+            return Ok(Some(by_signal()));
         };
         if outcome.decision.hand_over {
             duties.keep(session.checkpoint());
@@ -145,20 +148,17 @@ impl Session {
             let Some(evaluation) = self.evaluate(due, &now, duties)? else {
                 return Ok(None);
             };
-            let histograms = self.histograms();
             let improved = self.take_down(&evaluation);
             let (ended, steps) = self.take_results();
-            let dumps = self.dumps();
-            let decision = self.decide(requests, duties.is_stopped_by_file(), improved)?;
             Ok(Some(Outcome {
                 iteration,
                 ended,
                 steps,
                 evaluation,
                 traffic,
-                histograms,
-                dumps,
-                decision,
+                histograms: self.histograms(),
+                dumps: self.dumps(),
+                decision: self.decide(requests, duties.is_stopped_by_file(), improved)?,
             }))
         };
         caught(iterate).with_context(|| format!("iteration {number}"))
@@ -179,24 +179,19 @@ impl Session {
         let exchange = &self.agent.exchange;
         let ended = exchange.all_gather(pool.take_finished()).concat();
         let sums: Vec<StepSums> = pool.envs_mut().map(Repose::take_sums).collect();
-        let total = |sums: &[StepSums]| {
-            let mut total = StepSums::default();
-            sums.iter().for_each(|sums| total += *sums);
-            total
-        };
-        let steps = exchange.sum(&sums, total, |mut sum, more| {
+        let add = |mut sum: StepSums, more| {
             sum += more;
             sum
-        });
-        (ended, steps)
+        };
+        let total = |sums: &[StepSums]| sums.iter().copied().fold(StepSums::default(), add);
+        (ended, exchange.sum(&sums, total, add))
     }
 
     /// The histograms that are due after this iteration. Only the first rank has some.
     fn histograms(&self) -> Vec<(&'static str, Histogram)> {
-        let due =
-            self.agent.exchange.is_first() && self.agent.iteration.is_multiple_of(HISTOGRAMS_EVERY);
-        if due {
-            histograms(&self.agent.rollout)
+        let agent = &self.agent;
+        if agent.exchange.is_first() && agent.iteration.is_multiple_of(HISTOGRAMS_EVERY) {
+            histograms(&agent.rollout)
         } else {
             Vec::new()
         }
@@ -233,12 +228,15 @@ impl Session {
     fn take_down(&mut self, evaluation: &Score) -> bool {
         let found = [evaluation["goals"], evaluation["rot_dist"]];
         let improved = beats(found, self.best);
-        self.best = if improved { Some(found) } else { self.best };
+        if improved {
+            self.best = Some(found);
+        }
         // While the critic learns alone, an evaluation cannot rise.
-        if evaluation.episodes > 0 && !self.agent.ppo.is_critic_alone(self.agent.iteration) {
-            self.rise
-                .iter_mut()
-                .for_each(|rise| rise.add(figures(evaluation)));
+        if evaluation.episodes > 0
+            && !self.agent.ppo.is_critic_alone(self.agent.iteration)
+            && let Some(rise) = &mut self.rise
+        {
+            rise.add(figures(evaluation));
         }
         improved
     }
@@ -276,9 +274,9 @@ impl Session {
             Ok(())
         })?;
         let score = played.map(|played| Score::of(&played, ctrl_dt));
-        score
-            .iter()
-            .for_each(|score| duties.evaluated(self.agent.env_steps, score));
+        if let Some(score) = &score {
+            duties.evaluated(self.agent.env_steps, score);
+        }
         Ok(score)
     }
 }

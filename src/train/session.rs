@@ -8,7 +8,7 @@ use super::saver::Saver;
 use super::start::{Plan, Takes};
 use crate::agent::Agent;
 use crate::cli::TrainArgs;
-use crate::config::{Config, Settings, Source};
+use crate::config::{Config, Source};
 use crate::evaluate::{expect_finite_actions, expect_finite_values};
 use crate::os::{self, say};
 use crate::ppo::{Checkpoint, Rise};
@@ -46,7 +46,8 @@ impl Session {
         if let (Some(folder), Some(init)) = (&args.run_dir, &args.init) {
             run::expect_other_policy(folder, init)?;
         }
-        let (plan, existing) = Plan::of(args)?;
+        let mut plan = Plan::of(args)?;
+        let existing = plan.existing.take();
         let session = Self::set_up(plan, exchange)?;
         // A new folder is created last, so that a training run that cannot be set up leaves none behind.
         let place = match existing {
@@ -80,12 +81,12 @@ impl Session {
         os::start_threads(threads)?;
         let session = Self::new(plan, loaded, exchange)?;
         let exchange = &session.agent.exchange;
-        let warning = exchange
-            .expect_alike(&session.scene)?
-            .filter(|_| exchange.is_first() && threads == 0);
-        warning
-            .iter()
-            .for_each(|warning| say!("warning: {warning}"));
+        if let Some(warning) = exchange.expect_alike(&session.scene)?
+            && exchange.is_first()
+            && threads == 0
+        {
+            say!("warning: {warning}");
+        }
         Ok(session)
     }
 
@@ -100,6 +101,7 @@ impl Session {
             best,
             context,
             dumps,
+            ..
         } = plan;
         let set_up = || {
             // As it is saved.
@@ -115,16 +117,14 @@ impl Session {
                 rise: None,
                 dumps,
             };
-            from.map_or(Ok(()), |(takes, checkpoint)| {
-                session.start(takes, checkpoint)
-            })?;
+            if let Some((takes, checkpoint)) = from {
+                session.start(takes, checkpoint)?;
+            }
             Ok(session)
         };
-        let session = set_up();
-        if let Some(context) = context {
-            session.context(context)
-        } else {
-            session
+        match context {
+            Some(context) => set_up().context(context),
+            None => set_up(),
         }
     }
 
@@ -138,9 +138,7 @@ impl Session {
         }
         agent.restore(&mut checkpoint)?;
         if let Takes::Fork = takes {
-            let parent = Settings::new()
-                .file(Source::new("the checkpoint", &*checkpoint.config))
-                .resolve()?;
+            let parent = Source::new("the checkpoint", &*checkpoint.config).resolve()?;
             agent.ppo.reconcile_learning_rate(&parent.ppo);
             return checkpoint.finish();
         }

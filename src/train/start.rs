@@ -30,6 +30,8 @@ pub struct Plan {
     pub context: Option<String>,
     /// Whether to write the steps that led to diverged states.
     pub dumps: bool,
+    /// The folder of a run that is resumed, and the lock on it.
+    pub existing: Option<(RunFolder, Locked)>,
 }
 
 /// What a training run takes from the checkpoint that it starts from.
@@ -43,8 +45,13 @@ pub enum Takes {
     Fork,
 }
 
-/// The folder of a run that is resumed, and the lock on it.
-pub type Existing = (RunFolder, Locked);
+/// The settings that a fork keeps: they determine the size of the state or the kind of policy.
+const KEPT: [&str; 4] = [
+    "env.num_envs",
+    "ppo.hidden",
+    "ppo.symmetry",
+    "ppo.activation",
+];
 
 /// The parts of a plan as they are sent: the settings as text, the checkpoint as a file.
 type PlanParts = (
@@ -56,17 +63,15 @@ type PlanParts = (
 );
 
 impl Plan {
-    /// Plans what the command line asks for, in the folder of a run if it exists.
+    /// Plans what the command line asks for.
     ///
     /// # Errors
     /// Fails as [`Plan::new_run`], [`Plan::resume`] and [`Plan::fork`] do.
-    pub fn of(args: &TrainArgs) -> Result<(Self, Option<Existing>)> {
+    pub fn of(args: &TrainArgs) -> Result<Self> {
         match (&args.resume, &args.fork) {
-            (Some(place), _) => {
-                Self::resume(place.as_deref(), args).map(|(plan, existing)| (plan, Some(existing)))
-            }
-            (None, Some(place)) => Self::fork(place, args).map(|plan| (plan, None)),
-            (None, None) => Self::new_run(args).map(|plan| (plan, None)),
+            (Some(place), _) => Self::resume(place.as_deref(), args),
+            (None, Some(place)) => Self::fork(place, args),
+            (None, None) => Self::new_run(args),
         }
     }
 
@@ -88,6 +93,7 @@ impl Plan {
             best: None,
             context: None,
             dumps: args.dump_diverged,
+            existing: None,
         })
     }
 
@@ -103,22 +109,19 @@ impl Plan {
         let origin = PolicySource::find(place)?;
         let (checkpoint, played) = origin.load_for_any_scene()?;
         let settings = settings.stored(load::source(&checkpoint, place), Reader::NewRun);
-        let plan = Self::new(settings.resolve()?, args)?;
+        let mut plan = Self::new(settings.resolve()?, args)?;
         expect_net(&checkpoint, &played.ppo, &plan.config.ppo)
             .with_context(|| format!("cannot start from the policy {origin}"))?;
-        let context = Some(format!("cannot start from the policy {}", place.display()));
-        Ok(Self {
-            from: Some((Takes::Policy, checkpoint)),
-            context,
-            ..plan
-        })
+        plan.from = Some((Takes::Policy, checkpoint));
+        plan.context = Some(format!("cannot start from the policy {}", place.display()));
+        Ok(plan)
     }
 
     /// Plans to resume a training run from the newest undamaged checkpoint of a run, or from the given one. Locks its folder.
     ///
     /// # Errors
     /// Fails if a setting is given that cannot be changed, or if the run cannot be resumed.
-    fn resume(place: Option<&Path>, args: &TrainArgs) -> Result<(Self, Existing)> {
+    fn resume(place: Option<&Path>, args: &TrainArgs) -> Result<Self> {
         let place = place.map(Path::to_owned).or_else(run::newest_run);
         let place = place.context(
             "--resume: there is no run in runs/shadow-hand-repose; name the folder of a run",
@@ -133,27 +136,27 @@ impl Plan {
         let (path, checkpoint) = load::newest_sound(|| checkpoints_at(&place))
             .with_context(|| format!("cannot resume {}", place.display()))?;
         let context = format!("cannot resume from {}", path.display());
-        let config = load::settings(&checkpoint, &path, Reader::Run, &overrides(args));
-        let config = config.with_context(|| context.clone())?;
-        expect_same(
-            &Settings::new()
-                .file(load::source(&checkpoint, &path))
-                .resolve()?,
-            &config,
-        )?;
-        expect_states(&checkpoint, &config).with_context(|| context.clone())?;
+        let config = load::settings(&checkpoint, &path, Reader::Run, &overrides(args))
+            .context(context.clone())?;
+        let stored = load::source(&checkpoint, &path).resolve()?;
+        let differing = stored.differences(&config);
+        ensure!(
+            differing.is_empty(),
+            "{}: a resumed run accepts only {MODEL}, --total-steps and --threads; use --fork for other settings",
+            differing.join("; ")
+        );
+        expect_states(&checkpoint, &config).context(context.clone())?;
         expect_config(&folder, &config)?;
         // The best evaluation comes from the folder. It may have been saved after the checkpoint that is resumed, and a worse
         // one must not replace it.
         let best = best_so_far(&folder, checkpoint.progress.best);
-        let from = Some((Takes::State, checkpoint));
-        let plan = Self {
-            from,
+        Ok(Self {
+            from: Some((Takes::State, checkpoint)),
             best,
             context: Some(context),
+            existing: Some((folder, lock)),
             ..Self::new(config, args)?
-        };
-        Ok((plan, (folder, lock)))
+        })
     }
 
     /// Plans a new run that starts from the newest undamaged checkpoint of another, or from the given one. Settings may
@@ -172,25 +175,26 @@ impl Plan {
         let (path, checkpoint) =
             load::newest_sound(|| checkpoints_at(place)).with_context(context)?;
         let context = format!("cannot fork {}", path.display());
-        let plan = Self::forked(&path, checkpoint, args).with_context(|| context.clone())?;
-        Ok(Self {
-            context: Some(context),
-            ..plan
-        })
+        let mut plan = Self::forked(&path, checkpoint, args).context(context.clone())?;
+        plan.context = Some(context);
+        Ok(plan)
     }
 
     fn forked(path: &Path, mut checkpoint: Checkpoint, args: &TrainArgs) -> Result<Self> {
         let (parent, config) = load::for_fork(&checkpoint, path, settings(args)?)?;
         expect_states(&checkpoint, &parent)?;
-        expect_kept(&parent, &config)?;
-        let plan = Self::new(config, args)?;
+        for (key, [before, now]) in parent.compared_with(&config) {
+            ensure!(
+                !KEPT.contains(&&*key),
+                "{key} = {}: a fork keeps {}, the value of its checkpoint",
+                short(&now),
+                short(&before)
+            );
+        }
+        let mut plan = Self::new(config, args)?;
         let config = &plan.config;
         expect_scene(&parent, config, &checkpoint)?;
-        let from = path
-            .canonicalize()
-            .unwrap_or_else(|_| path.to_owned())
-            .display()
-            .to_string();
+        let whole = path.canonicalize();
         let progress = &mut checkpoint.progress;
         ensure!(
             progress.env_steps < config.run.total_steps,
@@ -199,16 +203,14 @@ impl Plan {
             progress.env_steps
         );
         progress.fork = Some(Fork {
-            from,
+            from: whole.as_deref().unwrap_or(path).display().to_string(),
             iteration: progress.iteration,
             env_steps: progress.env_steps,
         });
         // Scores under different settings are not comparable, so the best one is not kept.
         progress.best = None;
-        Ok(Self {
-            from: Some((Takes::Fork, checkpoint)),
-            ..plan
-        })
+        plan.from = Some((Takes::Fork, checkpoint));
+        Ok(plan)
     }
 
     /// Loads the task for the policy of the plan, and takes over what its scene gives. Returns it with the policy's record.
@@ -216,7 +218,7 @@ impl Plan {
     /// # Errors
     /// Fails if the scene cannot be used, or if the policy is for another hand.
     pub fn load_task(&mut self) -> Result<(Arc<Task>, Record)> {
-        let load = || {
+        let load = || -> Result<_> {
             let config = &self.config;
             let task = Task::new(config)?;
             let record = match &self.from {
@@ -227,11 +229,9 @@ impl Plan {
             Record::parse(&record.to_text())?;
             Ok((task.for_policy(&record)?, record))
         };
-        let loaded: Result<_> = load();
-        let loaded = if let Some(context) = &self.context {
-            loaded.context(context.clone())
-        } else {
-            loaded
+        let loaded = match &self.context {
+            Some(context) => load().context(context.clone()),
+            None => load(),
         }?;
         self.config.env = loaded.0.config.clone();
         Ok(loaded)
@@ -242,20 +242,16 @@ impl Plan {
     /// # Errors
     /// Fails if a value in the checkpoint is not finite.
     pub fn send(&self, exchange: &Exchange) -> Result<()> {
-        if !exchange.is_alone() {
-            let bytes = |(takes, checkpoint): &(Takes, Checkpoint)| {
-                checkpoint.to_bytes().map(|bytes| (*takes, bytes))
-            };
-            let config = self.config.to_text();
-            let from = self.from.as_ref().map(bytes).transpose()?;
-            exchange.broadcast::<PlanParts>(Some((
-                config,
-                from,
-                self.best,
-                self.context.clone(),
-                self.dumps,
-            )));
+        if exchange.is_alone() {
+            return Ok(());
         }
+        let from = match &self.from {
+            Some((takes, checkpoint)) => Some((*takes, checkpoint.to_bytes()?)),
+            None => None,
+        };
+        let config = self.config.to_text();
+        let context = self.context.clone();
+        exchange.broadcast::<PlanParts>(Some((config, from, self.best, context, self.dumps)));
         Ok(())
     }
 
@@ -265,17 +261,18 @@ impl Plan {
     /// Fails if the sender runs another version of the program.
     pub fn receive(exchange: &Exchange) -> Result<Self> {
         let (config, from, best, context, dumps) = exchange.broadcast::<PlanParts>(None);
-        let config = Settings::new()
-            .file(Source::new("the settings that were sent", config))
-            .resolve()?;
-        let from = from
-            .map(|(takes, bytes)| Checkpoint::parse(&bytes).map(|checkpoint| (takes, checkpoint)));
+        let config = Source::new("the settings that were sent", config).resolve()?;
+        let from = match from {
+            Some((takes, bytes)) => Some((takes, Checkpoint::parse(&bytes)?)),
+            None => None,
+        };
         Ok(Self {
             config,
-            from: from.transpose()?,
+            from,
             best,
             context,
             dumps,
+            existing: None,
         })
     }
 }
@@ -302,25 +299,13 @@ fn overrides(args: &TrainArgs) -> Vec<Override> {
         ("run.threads", args.threads.map(|n| n as u64)),
         ("run.total_steps", args.total_steps),
     ];
-    let given = options
-        .into_iter()
-        .filter_map(|(key, value)| Some((key, value?)));
-    let given = given.map(|(key, value)| Override {
-        key: key.into(),
-        value: value.to_string(),
+    let given = options.into_iter().filter_map(|(key, value)| {
+        Some(Override {
+            key: key.into(),
+            value: value?.to_string(),
+        })
     });
     args.settings.set.iter().cloned().chain(given).collect()
-}
-
-/// Checks that a resumed run has the settings that are `stored` in its checkpoint.
-fn expect_same(stored: &Config, config: &Config) -> Result<()> {
-    let differing = stored.differences(config);
-    ensure!(
-        differing.is_empty(),
-        "{}: a resumed run accepts only {MODEL}, --total-steps and --threads; use --fork for other settings",
-        differing.join("; ")
-    );
-    Ok(())
 }
 
 /// Checks that the settings in the folder match the checkpoint, because edits to them would be ignored.
@@ -332,11 +317,7 @@ fn expect_config(folder: &RunFolder, config: &Config) -> Result<()> {
         "restore {} or delete it; to change settings, start a new run with --fork",
         path.display()
     );
-    let source = Source::new(path.clone(), text);
-    let found = Settings::new()
-        .file(source)
-        .resolve()
-        .with_context(|| advice.clone())?;
+    let found = Source::new(&path, text).resolve().context(advice.clone())?;
     let differing = config.differences(&found);
     ensure!(
         differing.is_empty(),
@@ -359,24 +340,6 @@ fn expect_net(checkpoint: &Checkpoint, stored: &PpoConfig, settings: &PpoConfig)
     Ok(())
 }
 
-/// Checks that a fork keeps the settings that determine the size of the state or the kind of policy.
-fn expect_kept(parent: &Config, config: &Config) -> Result<()> {
-    let kept = [
-        "env.num_envs",
-        "ppo.hidden",
-        "ppo.symmetry",
-        "ppo.activation",
-    ];
-    for (key, [before, now]) in parent.compared_with(config) {
-        let [before, now] = [before, now].map(|value| short(&value));
-        ensure!(
-            !kept.contains(&&*key),
-            "{key} = {now}: a fork keeps {before}, the value of its checkpoint"
-        );
-    }
-    Ok(())
-}
-
 /// Checks that the scene is the scene of the checkpoint. Its physics may change: timestep, cones, masses, sizes, servos, joints.
 fn expect_scene(parent: &Config, config: &Config, checkpoint: &Checkpoint) -> Result<()> {
     let mut before = parent.clone();
@@ -384,9 +347,8 @@ fn expect_scene(parent: &Config, config: &Config, checkpoint: &Checkpoint) -> Re
     before.hand.clone_from(&config.hand);
     let task =
         Task::new(&before).context("a fork keeps the scene and the hand of its checkpoint")?;
-    let here = task.scene.fingerprint();
     ensure!(
-        checkpoint.scene == here,
+        checkpoint.scene == task.scene.fingerprint(),
         "{MODEL} = {}: not the scene of the checkpoint, which a fork must keep",
         config.env.model
     );

@@ -14,27 +14,21 @@ pub fn draw(rgb: &mut [u8], size: [u32; 2], lines: &[String]) {
     let spacing = (scaled.height() * 1.15).ceil();
 
     let margin = (0.6 * scaled.height()).ceil();
-    let longest = lines
-        .iter()
-        .map(|line| line.chars().count())
-        .max()
-        .unwrap_or(0);
+    let lengths = lines.iter().map(|line| line.chars().count());
+    let longest = lengths.max().unwrap_or(0);
     let across = longest as f32 * advance + 2.0 * margin;
     let down = lines.len() as f32 * spacing + margin;
     for row in rgb.chunks_exact_mut(3 * width).take(down as usize) {
-        let dark = &mut row[..3 * width.min(across as usize)];
-        dark.iter_mut()
-            .for_each(|channel| *channel = (u32::from(*channel) * 2 / 5) as u8);
+        for channel in &mut row[..3 * width.min(across as usize)] {
+            *channel = (u32::from(*channel) * 2 / 5) as u8;
+        }
     }
     for (i, line) in lines.iter().enumerate() {
         let baseline = 0.5 * margin + i as f32 * spacing + scaled.ascent();
         for (column, letter) in line.chars().enumerate() {
             let place = point(margin + column as f32 * advance, baseline);
-            if let Some(outline) = font.outline_glyph(
-                scaled
-                    .glyph_id(letter)
-                    .with_scale_and_position(scale, place),
-            ) {
+            let glyph = scaled.glyph_id(letter);
+            if let Some(outline) = font.outline_glyph(glyph.with_scale_and_position(scale, place)) {
                 draw_letter(rgb, [width, height], &outline);
             }
         }
@@ -49,10 +43,10 @@ fn draw_letter(rgb: &mut [u8], [width, height]: [usize; 2], outline: &OutlinedGl
         if (0..width as i64).contains(&x) && (0..height as i64).contains(&y) {
             let at = 3 * (y as usize * width + x as usize);
             let cover = cover.clamp(0.0, 1.0);
-            let channels = &mut rgb[at..at + 3];
-            channels
-                .iter_mut()
-                .for_each(|to| *to = (f32::from(*to) + (255.0 - f32::from(*to)) * cover) as u8);
+            for channel in &mut rgb[at..at + 3] {
+                let dark = f32::from(*channel);
+                *channel = (dark + (255.0 - dark) * cover) as u8;
+            }
         }
     });
 }

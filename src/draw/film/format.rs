@@ -1,4 +1,4 @@
-//! The common interface of the film encoders.
+//! What the film encoders need to know of a film.
 
 /// The parameters of a film file.
 #[derive(Clone, Copy)]
@@ -10,6 +10,3 @@ pub struct FilmFormat {
     /// The most frames that the film can have.
     pub longest: usize,
 }
-
-/// Frames `[height, width, 3]` for an encoder, which takes them one by one.
-pub type Frames<'a> = &'a mut dyn Iterator<Item = Vec<u8>>;

@@ -1,13 +1,12 @@
 //! GIF: one palette for the whole film. Each frame holds only what differs from the previous one.
 
-use std::borrow::Cow;
 use std::io::{BufWriter, Write};
 
 use anyhow::Result;
 use color_quant::NeuQuant;
 use gif::{DisposalMethod, Encoder, Frame, Repeat};
 
-use super::format::{FilmFormat, Frames};
+use super::format::FilmFormat;
 
 /// The number of colours in the palette. The index after them leaves a pixel unchanged.
 const COLOURS: usize = 255;
@@ -21,20 +20,19 @@ const PIXELS_FOR_PALETTE: usize = 400_000;
 ///
 /// # Errors
 /// Fails if the pictures are too large for a GIF, or if the file cannot be written.
-pub fn encode(file: impl Write, format: FilmFormat, frames: Frames) -> Result<()> {
+pub fn encode(
+    file: impl Write,
+    format: FilmFormat,
+    mut frames: impl Iterator<Item = Vec<u8>>,
+) -> Result<()> {
     let [width, height] = format.size.map(|pixels| pixels as usize);
-    let waiting: Vec<_> = Iterator::take(
-        &mut *frames,
-        BYTES_FOR_PALETTE / (3 * width * height).max(1),
-    )
-    .collect();
+    let most = BYTES_FOR_PALETTE / (3 * width * height).max(1);
+    let waiting: Vec<_> = frames.by_ref().take(most).collect();
     let mut palette = Palette::new(&waiting);
-    let columns = u16::try_from(width)?;
-    let rows = u16::try_from(height)?;
     let mut encoder = Encoder::new(
         BufWriter::new(file),
-        columns,
-        rows,
+        width.try_into()?,
+        height.try_into()?,
         &palette.quantizer.color_map_rgb(),
     )?;
     encoder.set_repeat(Repeat::Infinite)?;
@@ -58,15 +56,13 @@ fn changes(palette: &mut Palette, width: usize, previous: &[u8], rgb: &[u8]) -> 
     let height = rgb.len() / (3 * width);
     let pixel = |x: usize, y: usize| 3 * (y * width + x)..3 * (y * width + x) + 3;
     let changed = |x: usize, y: usize| previous.get(pixel(x, y)) != rgb.get(pixel(x, y));
-    let rows: Vec<usize> = (0..height)
-        .filter(|&y| (0..width).any(|x| changed(x, y)))
-        .collect();
-    let top = *rows.first().unwrap_or(&0);
-    let bottom = *rows.last().unwrap_or(&0);
+    let in_row = |y: &usize| (0..width).any(|x| changed(x, *y));
+    let top = (0..height).find(in_row).unwrap_or(0);
+    let bottom = (top..height).rev().find(in_row).unwrap_or(top);
     let in_column = |x: &usize| (top..=bottom).any(|y| changed(*x, y));
     let left = (0..width).find(in_column).unwrap_or(0);
     let right = (left..width).rev().find(in_column).unwrap_or(left);
-    let mut pixels = Vec::with_capacity((right + 1 - left) * (bottom + 1 - top));
+    let mut pixels = Vec::new();
     for y in top..=bottom {
         for x in left..=right {
             pixels.push(if changed(x, y) {
@@ -83,7 +79,7 @@ fn changes(palette: &mut Palette, width: usize, previous: &[u8], rgb: &[u8]) -> 
         left: left as u16,
         width: (right + 1 - left) as u16,
         height: (bottom + 1 - top) as u16,
-        buffer: Cow::Owned(pixels),
+        buffer: pixels.into(),
         ..Frame::default()
     }
 }

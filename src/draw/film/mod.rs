@@ -65,7 +65,7 @@ impl FilmWriter {
         let file = OutputFile::create(&to.path)?;
         let (frames, incoming) = sync_channel::<CaptionedFrame>(WAITING);
         let encode = move || {
-            let frames = &mut incoming.into_iter().map(|(mut rgb, lines)| {
+            let frames = incoming.into_iter().map(|(mut rgb, lines)| {
                 caption::draw(&mut rgb, format.size, &lines);
                 rgb
             });
@@ -108,8 +108,9 @@ impl FilmWriter {
             .encoder
             .join()
             .unwrap_or_else(|_| bail!("the encoder failed"));
-        let finished = encoded.and_then(|file| if keep { file.complete() } else { Ok(()) });
-        finished.with_context(|| format!("cannot write the film {}", self.path.display()))
+        encoded
+            .and_then(|file| if keep { file.complete() } else { Ok(()) })
+            .with_context(|| format!("cannot write the film {}", self.path.display()))
     }
 }
 

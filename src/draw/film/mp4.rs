@@ -20,7 +20,7 @@ use shiguredo_mp4::mux::{
     Mp4FileMuxer, Mp4FileMuxerOptions, Sample, estimate_maximum_moov_box_size,
 };
 
-use super::format::{FilmFormat, Frames};
+use super::format::FilmFormat;
 
 /// Seconds between key frames, which are the frames that a player can seek to.
 const KEY_FRAME_EVERY: u32 = 2;
@@ -30,15 +30,18 @@ const KEY_FRAME_EVERY: u32 = 2;
 /// # Errors
 /// Fails if the encoder cannot be started or skips a frame, if there are more frames than announced, or if the file cannot be
 /// written.
-pub fn encode(file: impl Write + Seek, format: FilmFormat, frames: Frames) -> Result<()> {
+pub fn encode(
+    file: impl Write + Seek,
+    format: FilmFormat,
+    frames: impl Iterator<Item = Vec<u8>>,
+) -> Result<()> {
     let size = (format.size[0] as usize, format.size[1] as usize);
     let mut encoder = encoder(format.fps)?;
     let mut yuv = YUVBuffer::new(size.0, size.1);
     let timescale =
         NonZeroU32::new(format.fps).context("the frame rate of a film must not be 0")?;
-    let reserved_moov_box_size = estimate_maximum_moov_box_size(&[format.longest]);
     let mut muxer = Mp4FileMuxer::with_options(Mp4FileMuxerOptions {
-        reserved_moov_box_size,
+        reserved_moov_box_size: estimate_maximum_moov_box_size(&[format.longest]),
         ..Default::default()
     })?;
     let mut file = BufWriter::new(file);
@@ -84,7 +87,7 @@ pub fn encode(file: impl Write + Seek, format: FilmFormat, frames: Frames) -> Re
 
 /// The units of a frame, each behind its length, as the file holds them.
 fn units_with_lengths(stream: &[u8]) -> Result<Vec<u8>> {
-    let mut data = Vec::with_capacity(stream.len());
+    let mut data = Vec::new();
     for unit in parse_annexb_nal_units(stream)? {
         // The parameter sets go into the index.
         if !matches!(
