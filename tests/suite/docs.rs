@@ -367,7 +367,7 @@ fn every_command_of_the_workflows_exists_and_packages_are_made_for_every_platfor
             );
         }
     }
-    assert_eq!(commands, 11);
+    assert_eq!(commands, 10);
     let release = read(".github/workflows/release.yml");
     let platforms = read("build.rs").matches("target: [\"").count();
     let is_known =
