@@ -1,7 +1,12 @@
 //! Reading whole files, and checking which file a path names.
 
+#[cfg(target_vendor = "apple")]
+use std::ffi::OsString;
 use std::fs::{self, File, Metadata};
 use std::io::{self, Read};
+use std::os::fd::AsRawFd;
+#[cfg(target_vendor = "apple")]
+use std::os::unix::ffi::OsStringExt;
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 use std::time::SystemTime;
@@ -14,8 +19,36 @@ const LARGEST_TEXT: u64 = 1 << 20;
 /// The most bytes of a binary file. The largest policy that the settings allow, its optimizer and 65536 environments take less.
 const LARGEST_BYTES: u64 = 1 << 30;
 
-/// Where the system lists the handles of this process. A path through one of them leads to what is open, whatever its name is.
-pub const HANDLES: &str = "/proc/self/fd";
+/// Where the system lists what is open, or everything, by number. A path through it leads there, whatever its name is.
+pub const HANDLES: &str = if cfg!(target_vendor = "apple") {
+    "/.vol"
+} else {
+    "/proc/self/fd"
+};
+
+/// The path of an open folder by its number in [`HANDLES`]: that of the handle or, on macOS, those of the volume and of the folder.
+pub fn through(handle: &File) -> io::Result<PathBuf> {
+    let by_number = if cfg!(target_vendor = "apple") {
+        let facts = handle.metadata()?;
+        format!("{}/{}", facts.dev(), facts.ino())
+    } else {
+        handle.as_raw_fd().to_string()
+    };
+    Ok(Path::new(HANDLES).join(by_number))
+}
+
+/// Where the system says that the folder with this path through [`HANDLES`] lies.
+#[cfg(target_vendor = "apple")]
+pub fn place_of(through: &Path) -> Option<PathBuf> {
+    let place = rustix::fs::getpath(File::open(through).ok()?).ok()?;
+    Some(OsString::from_vec(place.into_bytes()).into())
+}
+
+/// Where the system says that the folder with this path through [`HANDLES`] lies.
+#[cfg(not(target_vendor = "apple"))]
+pub fn place_of(through: &Path) -> Option<PathBuf> {
+    fs::read_link(through).ok()
+}
 
 /// An operation on a file or folder, whose error says what could not be done.
 pub trait Cannot<T> {
@@ -36,7 +69,9 @@ impl<T> Cannot<T> for io::Result<T> {
 pub fn shown(path: &Path) -> PathBuf {
     let through = || {
         let mut parts = path.strip_prefix(HANDLES).ok()?.components();
-        let folder = fs::read_link(Path::new(HANDLES).join(parts.next()?)).ok()?;
+        let numbers = if cfg!(target_vendor = "apple") { 2 } else { 1 };
+        let by_number: PathBuf = parts.by_ref().take(numbers).collect();
+        let folder = place_of(&Path::new(HANDLES).join(by_number))?;
         let whole = folder.join(parts.as_path());
         let here = std::env::current_dir().unwrap_or_default();
         Some(

@@ -1,17 +1,12 @@
 //! A folder that is held open, so that its files are found wherever it is moved.
 
-#[cfg(target_vendor = "apple")]
-use std::ffi::OsString;
 use std::fs::{self, File};
-use std::os::fd::AsRawFd;
-#[cfg(target_vendor = "apple")]
-use std::os::unix::ffi::OsStringExt;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::sync::Arc;
 
 use anyhow::Result;
 
-use super::file::{Cannot, HANDLES, expect_named};
+use super::file::{Cannot, HANDLES, expect_named, place_of, through};
 
 /// A folder that is known by its name or, once it is held, by a handle. Then its files are reached even after it was renamed, and
 /// what has taken its name is not.
@@ -39,65 +34,44 @@ impl Folder {
     /// # Errors
     /// Fails if it cannot be created or opened, or if something else has the name of a deleted one.
     pub fn hold(&mut self) -> Result<()> {
-        let created = match self.handle.clone() {
-            Some(handle) if self.is_alive(&handle) => {
-                self.path = self.path_to(&handle);
-                return Ok(());
-            }
+        let created = match &self.handle {
+            Some(handle) if self.is_alive(handle) => return Ok(()),
             Some(_) => fs::create_dir(&self.name),
             None => fs::create_dir_all(&self.name),
         };
         created.cannot("create the folder", &self.name)?;
         let handle = File::open(&self.name).cannot("open", &self.name)?;
-        self.path = self.path_to(&handle);
+        self.path = through(&handle).cannot("open", &self.name)?;
+        // Where the system lists no handles, the name must do.
+        if !self.path.is_dir() {
+            self.path.clone_from(&self.name);
+        }
         self.handle = Some(Arc::new(handle));
         Ok(())
     }
 
-    /// The path by which this open folder is reached: through its handle or, where the system lists no handles, where it lies now.
-    fn path_to(&self, handle: &File) -> PathBuf {
-        let through = through(handle);
-        if through.is_dir() {
-            through
-        } else {
-            place_of(handle).unwrap_or_else(|| self.name.clone())
+    /// Whether the path leads to this open folder, and the folder was not deleted. Not all file systems count the names of a folder, or
+    /// number it the same each time.
+    fn is_alive(&self, handle: &File) -> bool {
+        match self.link() {
+            Some(place) => !place.to_string_lossy().ends_with(" (deleted)") || place.exists(),
+            None => expect_named(&self.path, handle).is_ok(),
         }
     }
 
-    /// Whether this open folder was not deleted. Not all file systems count the names of a folder, or number it the same each time.
-    fn is_alive(&self, handle: &File) -> bool {
-        let place = place_of(handle).unwrap_or_else(|| self.name.clone());
-        if self.path.starts_with(HANDLES) {
-            !place.to_string_lossy().ends_with(" (deleted)") || place.exists()
-        } else {
-            expect_named(&place, handle).is_ok()
-        }
+    /// Where the system says that the held folder lies.
+    fn link(&self) -> Option<PathBuf> {
+        let is_through = self.path.starts_with(HANDLES);
+        is_through.then(|| place_of(&self.path)).flatten()
     }
 
     /// The path where the folder lies now: its name, unless it was moved.
     pub fn place(&self) -> PathBuf {
-        let place = self.handle.as_deref().and_then(place_of);
-        let moved = place.filter(|place| self.name.canonicalize().ok().as_ref() != Some(place));
+        let moved = self
+            .link()
+            .filter(|place| self.name.canonicalize().ok().as_ref() != Some(place));
         moved.unwrap_or_else(|| self.name.clone())
     }
-}
-
-/// The path that the system has for this handle, if it lists handles.
-fn through(handle: &File) -> PathBuf {
-    Path::new(HANDLES).join(handle.as_raw_fd().to_string())
-}
-
-/// Where the system says that an open folder lies.
-#[cfg(target_vendor = "apple")]
-fn place_of(handle: &File) -> Option<PathBuf> {
-    let path = rustix::fs::getpath(handle).ok()?;
-    Some(OsString::from_vec(path.into_bytes()).into())
-}
-
-/// Where the system says that an open folder lies.
-#[cfg(not(target_vendor = "apple"))]
-fn place_of(handle: &File) -> Option<PathBuf> {
-    fs::read_link(through(handle)).ok()
 }
 
 #[cfg(test)]
@@ -119,10 +93,6 @@ mod tests {
         assert_eq!(folder.place(), name);
         fs::rename(&name, &moved).unwrap();
         fs::create_dir(&name).unwrap();
-        if !Path::new(HANDLES).exists() {
-            // Where the system lists no handles, it says where the folder lies.
-            folder.hold().unwrap();
-        }
         fs::write(folder.path.join("file"), "").unwrap();
         assert!(moved.join("file").exists() && !name.join("file").exists());
         assert_eq!(folder.place(), moved);

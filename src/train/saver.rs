@@ -171,8 +171,6 @@ impl Saver {
         self.expect_own()?;
         let folder = &mut self.held.folder;
         if !self.lock.as_ref().is_some_and(Locked::holds) {
-            // The lock file may have moved with the folder. It can be locked once only.
-            self.lock = None;
             let lock = folder.lock()?;
             self.lock = Some(folder.claim(lock)?);
         }
