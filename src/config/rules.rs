@@ -9,9 +9,11 @@ use super::overlay::{brief, lookup, number, settings};
 use super::settings::{Backend, Config, PpoConfig, Precision};
 use crate::os::shortened;
 
-/// The ranges of settings: keys, separated by spaces, the rule for their numbers, and its text. Both ends of a ramp must lie in its
-/// range, and so must all values by group.
-const RANGES: [(&str, fn(f64) -> bool, &str); 5] = [
+/// Keys, separated by spaces, the rule for their numbers, and its text.
+type Range = (&'static str, fn(f64) -> bool, &'static str);
+
+/// The ranges of settings. Both ends of a ramp must lie in its range, and so must all values by group.
+const RANGES: [Range; 5] = [
     (
         "env.sim_dt env.ctrl_dt env.rot_eps env.success_tolerance env.fall_dist training.tolerance ppo.learning_rate ppo.clip \
          ppo.max_grad_norm ppo.reward_scale ppo.std",

@@ -382,7 +382,7 @@ mod tests {
         Subplot {
             title: title.into(),
             curves,
-            nothing: "nothing yet".into(),
+            nothing: "nothing yet",
         }
     }
 
@@ -398,7 +398,7 @@ mod tests {
         let legend = (1..=curves).map(|i| format!("run {i}")).collect();
         let chart = Chart {
             legend,
-            along: "steps".into(),
+            along: "steps",
             panels,
             size: None,
         };

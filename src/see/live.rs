@@ -24,11 +24,14 @@ const BETWEEN_ROWS: f64 = 0.02;
 /// The time between two looks at the clock.
 const TICK: Duration = Duration::from_millis(5);
 
+/// Takes one step of an episode, and returns its end if there is one.
+type Stepping = dyn Fn(&mut Player) -> Option<End>;
+
 /// Who acts in an episode.
 #[derive(Clone)]
 pub struct LiveActor {
-    /// Takes one step of an episode, and returns its end if there is one.
-    pub step: Rc<dyn Fn(&mut Player) -> Option<End>>,
+    /// Takes one step.
+    pub step: Rc<Stepping>,
     /// The page's name for the policy, if it differs from the name for the whole page.
     pub policy: Option<String>,
     /// The task that it acts in.
