@@ -64,13 +64,18 @@ impl PolicySource {
             Actor::without_policy(place).is_none(),
             "`{name}` acts without a policy; a file or folder of that name is ./{name}"
         );
-        match BUILTIN
-            .iter()
-            .find(|policy| place == Path::new(policy.name))
-        {
-            Some(policy) => Ok(Self::BuiltIn(policy)),
-            None => run::resolve_checkpoint(place).map(Self::File),
+        let mut built_in = BUILTIN.iter();
+        if let Some(policy) = built_in.find(|policy| place == Path::new(policy.name)) {
+            return Ok(Self::BuiltIn(policy));
         }
+        let newest = run::newest_run()
+            .map(|run| format!("; the newest run is {}", run.display()))
+            .unwrap_or_default();
+        ensure!(
+            place.exists(),
+            "{name}: no such checkpoint or run folder; built in are builtin and robust{newest}"
+        );
+        run::resolve_checkpoint(place).map(Self::File)
     }
 
     /// The file, or the name of what is built in.

@@ -210,6 +210,7 @@ fn growth(rows: u64) -> i64 {
             &values,
             &[],
             &Status {
+                assisted: false,
                 env_steps: row,
                 steps_per_s: 1e4,
                 goals: 0.5,

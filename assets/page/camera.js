@@ -24,6 +24,15 @@ function sightOf({ azimuth, elevation, distance, center, fovy }) {
   return { eye: plus(center, forward, -distance), forward, distance, tangent: Math.tan(fovy * Math.PI / 360) };
 }
 
+/** Returns what maps a point of the world to the tile [left, top, width, height]: [x, y, distance from the eye]. */
+function projectionOf({ eye, forward, tangent }, [left, top, width, height]) {
+  const view = lookAlong(eye, forward, [0, 0, 1]), zoom = height / 2 / (tangent * Math.max(1, .9 * height / width));
+  return ([a, b, c]) => {
+    const [x, y, z] = [0, 1, 2].map((k) => view[k] * a + view[k + 4] * b + view[k + 8] * c + view[k + 12]);
+    return [left + width / 2 - zoom * x / z, top + height / 2 + zoom * y / z, -z];
+  };
+}
+
 class Orbit {
   /** Calls `changed` after each move, and `picked` with the place of a click that moves nothing. */
   constructor(first, changed, picked) {

@@ -28,13 +28,8 @@ class FlatPicture {
     });
   }
 
-  drawTile(poses, { eye, forward, tangent }, [left, top, width, height]) {
-    const { context, scene } = this, view = lookAlong(eye, forward, [0, 0, 1]);
-    const zoom = height / 2 / (tangent * Math.max(1, .9 * height / width));
-    const project = ([a, b, c]) => {
-      const [x, y, z] = [0, 1, 2].map((k) => view[k] * a + view[k + 4] * b + view[k + 8] * c + view[k + 12]);
-      return [left + width / 2 - zoom * x / z, top + height / 2 + zoom * y / z, -z];
-    };
+  drawTile(poses, sight, tile) {
+    const { context, scene } = this, project = projectionOf(sight, tile);
     const faces = [], shadow = new Path2D();
     for (const { geom, points, faces: corners } of this.parts) {
       const pose = [...poses.subarray(8 * geom.body, 8 * geom.body + 8)], quat = pose.slice(4), glass = geom.rgba[3] < 1;

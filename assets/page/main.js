@@ -1,6 +1,7 @@
 // The page: time, keys, and what is drawn when.
 
 const SPEEDS = [.1, .25, .5, 1, 2, 4];
+const PAUSE = 300; // milliseconds after which a picture that does not move is drawn in full
 const DELAY = .12; // seconds that a live picture is behind, so that uneven arrival is not seen
 
 /** What the page's address asks for: #t=3.2 a moment, #picture=full, simple or flat a kind of picture. */
@@ -40,6 +41,27 @@ class Screen {
       }
     }
     if (!this.picture) this.fallBack(reason);
+    [this.coarse, this.full, this.fine] = [this.picture, null, false];
+    if (this.kind === "simple" && !this.fixed) this.offerFull();
+  }
+
+  /** Says that the picture is a simple one while something moves, and links to a full one. */
+  offerFull() {
+    notice.link = make("a", "", "Draw it always in full");
+    notice.link.href = "#picture=full";
+    notice.link.onclick = () => setTimeout(() => location.reload());
+    notice.lasting = "This browser draws without a graphics card, so the picture is a simple one while something moves.";
+    notice("");
+  }
+
+  /** Changes to the full picture where nothing moves, or back. Returns whether that is another one than before. */
+  refine(fine) {
+    if (this.kind !== "simple" || this.fixed || this.fine === fine || !this.picture) return false;
+    const { scene, meshes, hands } = this;
+    this.fine = fine;
+    if (fine) this.full ??= new CardPicture(this.coarse.gl, scene, meshes, hands, false);
+    this.picture = fine ? this.full : this.coarse;
+    return true;
   }
 
   /** A canvas that was asked for one kind of picture gives no other: it is replaced. */
@@ -200,7 +222,11 @@ class Player {
     this.last = time;
     if (!this.recording.rows.length) return;
     if (this.playing) this.advance(seconds);
-    if (!this.dirty || !this.screen.picture) return;
+    if (!this.screen.picture) return;
+    const rests = !this.dirty && !this.playing && time - this.moved > PAUSE;
+    if (this.dirty) this.moved = time;
+    if ((this.dirty || rests) && this.screen.refine(rests)) [this.sized, this.dirty] = [false, true];
+    if (!this.dirty) return;
     this.adapt(seconds);
     if (!this.sized) this.layOut();
     this.dirty = false;
@@ -227,12 +253,25 @@ class Player {
       kinematics(scene.bodies, numbers, this.poses.subarray(i * bodies, (i + 1) * bodies));
     }
     this.screen.picture.draw(this.poses, this.orbit.sight, this.tone);
+    this.drawGoal();
     if (this.live && this.line.stale) this.rewards.measure();
     this.line.draw(now);
     this.facts.draw(row, hand);
     this.rewards.draw(row, hand);
     this.lists.draw(row, hand);
     this.drawClock(row, hand);
+  }
+
+  /** Puts the word "goal" over the goal, which is of glass. */
+  drawGoal() {
+    const label = byId("goal"), { recording, screen, poses } = this, glass = this.scene.geoms.find(({ rgba }) => rgba[3] < 1);
+    label.hidden = !glass || !recording.has("goals") || recording.hands > 1;
+    if (label.hidden) return;
+    const [x, y, z] = poses.subarray(8 * glass.body), { clientWidth, clientHeight } = screen.canvas;
+    const project = projectionOf(this.orbit.sight, [0, 0, clientWidth, clientHeight]);
+    const [left, above, away] = project([x, y, z + Math.hypot(...glass.size)]);
+    label.hidden = away <= 0;
+    [label.style.left, label.style.top] = [`${left}px`, `${above}px`];
   }
 
   drawClock(row, hand) {

@@ -1,11 +1,11 @@
 // The words and bars over the picture.
 
 const byId = (id) => document.getElementById(id);
-/** Shows a sentence; without one, `notice.lasting`, which is true as long as the page is open. */
+/** Shows a sentence; without one, `notice.lasting`, which is true as long as the page is open, and a link if that has one. */
 function notice(text) {
   const shown = text || notice.lasting || "";
   byId("notice").hidden = !shown;
-  byId("notice").textContent = shown;
+  byId("notice").replaceChildren(shown, ...(text || !notice.link ? [] : [" ", notice.link]));
 }
 
 function make(kind, name, text = "") {
@@ -28,6 +28,8 @@ class Facts {
     this.recording = recording;
     const { meta } = recording;
     byId("title").textContent = meta.title;
+    byId("what").hidden = !recording.has("goals");
+    byId("what").textContent = "The hand turns the lower object until it matches the goal above it.";
     document.title = meta.live ? `${meta.title} (live)` : meta.title;
     this.about = "";
   }
@@ -71,7 +73,7 @@ class Rewards {
     this.bars = recording.meta.terms.map((term) => ({ term, bar: make("b", ""), value: make("span", ""), sum: make("span", "sum") }));
     const box = byId("rewards");
     box.hidden = !this.bars.length;
-    box.append(make("span", "head"), make("i", "head"), make("span", "head", "now"), make("span", "head end", "in total"));
+    box.append(make("span", "head begin", "reward"), make("i", "head"), make("span", "head", "now"), make("span", "head end", "in total"));
     box.children[1].style.background = "none";
     for (const { term, bar, value, sum } of this.bars) {
       const track = make("i", "");

@@ -95,7 +95,7 @@ class Hand:
             self.actuators = [self.model.actuator(name) for name in policy.names("joint_names")]
             cube = self.model.body(policy.facts["object_name"])
         except (KeyError, ValueError) as error:
-            sys.exit(f"error: {scene} is not the policy's hand: {str(error.args[0]).splitlines()[0]}")
+            sys.exit(f"error: {scene} is not the policy's hand: {str(error.args[0]).splitlines()[0]}; name its scene by --scene FILE")
         self.data = mujoco.MjData(self.model)
         self.substeps = round(env["ctrl_dt"] / env["sim_dt"])
         self.angle = np.array([joint.qposadr[0] for joint in joints])

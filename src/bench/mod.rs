@@ -67,7 +67,8 @@ pub fn bench(args: &BenchArgs) -> Result<()> {
     let mut figures = json!({ "threads": threads, "num_envs": num_envs, "hidden": hidden });
     let samples = config.samples_per_minibatch();
     let mut lines = format!(
-        "{threads} threads, {num_envs} environments, nets {hidden:?}, minibatches of {samples}\n"
+        "{threads} thread{}, {num_envs} environments, nets {hidden:?}, minibatches of {samples}\n",
+        if threads == 1 { "" } else { "s" }
     );
     let measures: [(Part, Measurement); 4] = [
         (Part::Physics, physics_and_pool),

@@ -90,6 +90,11 @@ impl EnvConfig {
     }
 }
 
+/// Whether a setting follows from the scene.
+pub fn is_derived(key: &str) -> bool {
+    ["env.num_hand_dofs", "env.num_actuators"].contains(&key)
+}
+
 /// A value as `--set` takes it, without spaces.
 pub fn short(value: &Value) -> String {
     value.as_str().map_or_else(|| inner(value), str::to_owned)

@@ -51,7 +51,7 @@ pub const SHIPPED: [(&str, &str); 8] = [
 ];
 
 pub use applicability::expect_used;
-pub use differences::{Difference, short};
+pub use differences::{Difference, is_derived, short};
 pub use layers::{MODEL, Override, Reader, Settings, Source, scene_option};
 pub use ramp::{Geometric, Ramp};
 pub use rules::FARTHEST;

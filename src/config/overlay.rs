@@ -249,8 +249,15 @@ fn unknown(name: &str) -> String {
     let end = |key: &str| key.rsplit('.').next().unwrap_or_default().to_owned();
     let is_near = |key: &&str| strsim::damerau_levenshtein(&end(key), last) <= 1 + last.len() / 4;
     let holds = |key: &&str| last.len() > 2 && end(key).contains(last);
+    let initials = |key: &str| {
+        end(key)
+            .split('_')
+            .filter_map(|word| word.chars().next())
+            .collect::<String>()
+    };
     let near = similar(name, known(), '.').into_iter().find(is_near);
-    let hint = match near.or(known().find(holds)) {
+    let near = near.or(known().find(holds));
+    let hint = match near.or(known().find(|key| initials(key) == last)) {
         Some(nearest) => format!("did you mean {nearest}?"),
         None => "configs/repose.toml lists all of them".into(),
     };

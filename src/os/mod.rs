@@ -30,7 +30,7 @@ pub use output::{
     OutputFile, final_path, is_abandoned, make_own, name_also, nicety, put_aside,
     remove_unfinished, sync, sync_folder, unused_name, write_whole,
 };
-pub use progress::{Bar, Status, StatusLine, clock, progress_bar, steps_of_all};
+pub use progress::{Bar, Status, StatusLine, count, of_all, progress_bar, span};
 pub use screen::{Screen, aligned, text_of};
 pub use server::{OnPost, Place, Server};
 pub use similar::similar;

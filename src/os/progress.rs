@@ -5,6 +5,7 @@ use std::time::{Duration, Instant};
 use console::Term;
 use indicatif::{ProgressBar, ProgressFinish, ProgressStyle};
 
+use super::machine::is_shared;
 use super::stderr::progress_target;
 use super::{is_terminal, number, say, say_line};
 
@@ -30,6 +31,8 @@ pub struct Status {
     pub drop_rate: f64,
     /// Goals per episode of an evaluation.
     pub evaluation: f64,
+    /// Whether training helps with turning the object.
+    pub assisted: bool,
 }
 
 /// The progress of a training run.
@@ -67,6 +70,7 @@ impl StatusLine {
             goals: unknown,
             drop_rate: unknown,
             evaluation: unknown,
+            assisted: false,
         };
         Self {
             bar,
@@ -85,7 +89,7 @@ impl StatusLine {
         let left = self.time_left();
         if let Some(bar) = &self.bar {
             let width = usize::from(Term::stderr().size().1).saturating_sub(1);
-            bar.set_message(self.shown.line(self.total_steps, left, width));
+            bar.set_message(self.shown.line(self.total_steps, &left, width));
         } else if !self.quiet
             && (self
                 .last_line
@@ -93,17 +97,12 @@ impl StatusLine {
                 || status.env_steps >= self.total_steps)
         {
             self.last_line = Some(Instant::now());
-            let parts = self.shown.parts(left).join("  ");
-            say!(
-                "{} of {} steps  {parts}",
-                status.env_steps,
-                self.total_steps
-            );
+            say!("{}", self.shown.line(self.total_steps, &left, usize::MAX));
         }
     }
 
-    /// Estimates the time left at the pace of this session, including evaluations.
-    fn time_left(&self) -> Duration {
+    /// Estimates the time left at the pace of this session, including evaluations. Says if others use the machine.
+    fn time_left(&self) -> String {
         let made = self
             .shown
             .env_steps
@@ -111,7 +110,13 @@ impl StatusLine {
             .max(1);
         let pace = self.begun.elapsed().as_secs_f64() / made as f64;
         let left = pace * self.total_steps.saturating_sub(self.shown.env_steps) as f64;
-        Duration::try_from_secs_f64(left).unwrap_or(Duration::MAX)
+        let left = span(Duration::try_from_secs_f64(left).unwrap_or(Duration::MAX));
+        let shared = if is_shared() {
+            " on a shared machine"
+        } else {
+            ""
+        };
+        format!("{left} left{shared}")
     }
 
     /// Prints a line above the progress line.
@@ -140,6 +145,7 @@ impl StatusLine {
 impl Status {
     fn update(&mut self, status: &Status) {
         self.env_steps = status.env_steps;
+        self.assisted = status.assisted;
         for (shown, new) in [
             (&mut self.steps_per_s, status.steps_per_s),
             (&mut self.goals, status.goals),
@@ -157,24 +163,29 @@ impl Status {
     }
 
     /// The parts of the line, the most important first.
-    fn parts(&self, left: Duration) -> Vec<String> {
+    fn parts(&self, left: &str) -> Vec<String> {
         let evaluated = if self.evaluation.is_nan() {
             String::new()
         } else {
             format!(" (eval {:.2})", self.evaluation)
         };
+        let goals = if self.assisted {
+            "assisted goals"
+        } else {
+            "goals"
+        };
         let per_cent = if self.drop_rate.is_nan() { "" } else { "%" };
         vec![
-            format!("{:.0} steps/s", self.steps_per_s),
-            format!("ETA {}", clock(left)),
-            format!("goals {}{evaluated}", number(self.goals, 2)),
+            format!("{} steps/s", count(self.steps_per_s)),
+            left.into(),
+            format!("{goals} {}{evaluated}", number(self.goals, 2)),
             format!("drops {}{per_cent}", number(100.0 * self.drop_rate, 0)),
         ]
     }
 
     /// The line with the parts that fit into `width` columns.
-    fn line(&self, total_steps: u64, left: Duration, width: usize) -> String {
-        let mut line = steps_of_all(self.env_steps, total_steps);
+    fn line(&self, total_steps: u64, left: &str, width: usize) -> String {
+        let mut line = format!("{} steps", of_all(self.env_steps, total_steps));
         for part in self.parts(left) {
             if line.len() + 2 + part.len() > width {
                 break;
@@ -185,30 +196,38 @@ impl Status {
     }
 }
 
-/// The steps made out of all steps, e.g. `10.01/200M`. The total has no zeros at its end.
-pub fn steps_of_all(env_steps: u64, total_steps: u64) -> String {
-    let (digits, unit, name) = match total_steps {
-        0..10_000 => return format!("{env_steps}/{total_steps}"),
-        10_000..1_000_000 => (1, 1e3, "k"),
-        _ => (2, 1e6, "M"),
-    };
-    let [made, total] =
-        [env_steps, total_steps].map(|steps| format!("{:.digits$}", steps as f64 / unit));
-    format!(
-        "{made}/{}{name}",
-        total.trim_end_matches('0').trim_end_matches('.')
-    )
+/// A part of a whole, e.g. `65.5 k of 200 M`.
+pub fn of_all(made: u64, all: u64) -> String {
+    format!("{} of {}", count(made as f64), count(all as f64))
 }
 
-/// A time as hours, minutes and seconds, e.g. `2:05:33`.
-pub fn clock(time: Duration) -> String {
+/// A count with three digits, e.g. `65.5 k`.
+pub fn count(count: f64) -> String {
+    let (unit, name) = match count {
+        999_500.0.. => (1e6, " M"),
+        999.5.. => (1e3, " k"),
+        _ => return number(count, 0),
+    };
+    let decimals = (2.0 - (count / unit).log10().floor()).max(0.0) as usize;
+    let digits = format!("{:.decimals$}", count / unit);
+    let digits = if decimals > 0 {
+        digits.trim_end_matches('0').trim_end_matches('.')
+    } else {
+        &digits
+    };
+    format!("{digits}{name}")
+}
+
+/// A time by its two largest units, e.g. `2 h 35 min`.
+pub fn span(time: Duration) -> String {
     let seconds = time.as_secs();
-    format!(
-        "{}:{:02}:{:02}",
-        seconds / 3600,
-        seconds / 60 % 60,
-        seconds % 60
-    )
+    let [minutes, hours, days] = [60, 3600, 86_400].map(|unit| seconds / unit);
+    match [days, hours, minutes] {
+        [0, 0, 0] => format!("{seconds} s"),
+        [0, 0, _] => format!("{minutes} min {} s", seconds % 60),
+        [0, ..] => format!("{hours} h {} min", minutes % 60),
+        _ => format!("{days} d {} h", hours % 24),
+    }
 }
 
 /// Whether nothing can be redrawn on the terminal.
@@ -238,41 +257,62 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_line_has_what_fits_into_63_and_80_columns() {
+    fn the_line_has_what_fits() {
         let status = Status {
             env_steps: 10_012_345,
             steps_per_s: 12_345.6,
             goals: 0.24,
             drop_rate: 0.335,
             evaluation: 5.75,
+            assisted: false,
         };
-        let line = |width| status.line(100_000_000, Duration::from_secs(7533), width);
-        let short = "10.01/100M  12346 steps/s  ETA 2:05:33  goals 0.24 (eval 5.75)";
-        assert_eq!(line(62), short);
+        let left = span(Duration::from_secs(7533));
+        let line = |width| status.line(100_000_000, &left, width);
+        let short = "10 M of 100 M steps  12.3 k steps/s  2 h 5 min  goals 0.24 (eval 5.75)";
+        assert_eq!(line(70), short);
         assert_eq!(line(79), format!("{short}  drops 34%"));
-        let k = Status {
-            env_steps: 12_544,
-            goals: 0.0,
-            drop_rate: 1.0,
-            evaluation: 0.0,
-            ..status
-        };
-        let expected = "12.5/25.6k  12346 steps/s  ETA 0:00:00  goals 0.00 (eval 0.00)  drops 100%";
-        assert_eq!(k.line(25_600, Duration::ZERO, 79), expected);
-        let total = |steps| steps_of_all(steps, steps);
-        assert_eq!(
-            [2_500_000, 999_999].map(total),
-            ["2.50/2.5M", "1000.0/1000k"]
-        );
         let few = Status {
             env_steps: 256,
             evaluation: f64::NAN,
             goals: f64::NAN,
+            assisted: true,
             ..status
         };
         assert!(
-            few.line(1280, Duration::ZERO, 79)
-                .starts_with("256/1280  12346 steps/s  ETA 0:00:00  goals -  drops")
+            few.line(1280, "0 s", 79)
+                .starts_with("256 of 1.28 k steps  12.3 k steps/s  0 s  assisted goals -  drops")
+        );
+    }
+
+    #[test]
+    fn counts_and_times_are_short() {
+        assert_eq!(
+            [
+                f64::NAN,
+                0.0,
+                999.0,
+                1000.0,
+                65_536.0,
+                999_499.0,
+                999_999.0,
+                10_049_000.0,
+                2e8
+            ]
+            .map(count),
+            [
+                "-", "0", "999", "1 k", "65.5 k", "999 k", "1 M", "10 M", "200 M"
+            ]
+        );
+        assert_eq!(
+            [0, 59, 61, 3600, 9300, 100_000].map(|seconds| span(Duration::from_secs(seconds))),
+            [
+                "0 s",
+                "59 s",
+                "1 min 1 s",
+                "1 h 0 min",
+                "2 h 35 min",
+                "1 d 3 h"
+            ]
         );
     }
 }

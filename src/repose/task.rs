@@ -187,8 +187,13 @@ impl Task {
         let alike = self.scene.symmetry(self.hand.object.body).len();
         let object = &self.hand.parts.object;
         if alike < CUBE_ROTATIONS.len() {
+            let mapping = if alike == 1 {
+                "no rotation of a cube but the identity maps".into()
+            } else {
+                format!("{alike} of the 24 rotations of a cube map")
+            };
             notes.push(format!(
-                "{alike} of the 24 rotations of a cube map `{object}` onto itself (ppo.symmetry = \"object\")"
+                "{mapping} `{object}` onto itself (ppo.symmetry = \"object\")"
             ));
         }
         let round = self.scene.round_axes(self.hand.object.body);

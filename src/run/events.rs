@@ -14,8 +14,9 @@ use tensorboard_proto::summary::{Summary, Summary_Value, Summary_Value_oneof_val
 use tensorboard_rs::record_writer::RecordWriter;
 
 use super::histogram::Histogram;
+use super::layout::layout;
 use super::records::length_up_to;
-use super::summary::{Descriptions, markdown, value};
+use super::summary::{Descriptions, text, value};
 use crate::os::{Cannot, expect_named, make_own, sync, sync_folder};
 
 /// The prefix and the suffix of the names of event files.
@@ -75,8 +76,9 @@ impl EventFile {
         };
         self.write(What::session_log(session), first_step)?;
         if !settings.is_empty() {
-            let settings = Content::tensor(markdown(&format!("```\n{settings}\n```\n")));
+            let settings = Content::tensor(text(format!("```\n{settings}\n```\n")));
             self.summary([(SETTINGS, settings)].into_iter(), first_step)?;
+            self.values(vec![layout()], first_step)?;
         }
         sync_folder(&self.path);
         Ok(())

@@ -49,14 +49,14 @@ pub fn with_metadata(tag: &str, content: Content, plugin: &str, data_class: u32)
     value
 }
 
-/// A text in Markdown.
-pub fn markdown(text: &str) -> TensorProto {
+/// A text: Markdown, or the bytes of a message.
+pub fn text(text: impl Into<Vec<u8>>) -> TensorProto {
     let mut tensor = TensorProto {
         dtype: DataType::DT_STRING,
         ..TensorProto::default()
     };
     // A shape without dimensions: a single string.
     tensor.mut_tensor_shape();
-    tensor.mut_string_val().push(text.as_bytes().to_vec());
+    tensor.mut_string_val().push(text.into());
     tensor
 }

@@ -6,7 +6,7 @@ use anyhow::{Context, Result};
 use serde_json::{Value, json};
 
 use super::found::Run;
-use crate::config::{Difference, short};
+use crate::config::{Difference, is_derived, short};
 use crate::os::{aligned, harmless, number};
 use crate::run::{read_metrics, value_at};
 
@@ -60,7 +60,11 @@ impl Comparison {
 
     /// The lines that follow the table of both runs.
     pub fn lines(&self) -> Vec<String> {
-        let settings = match self.settings.as_deref() {
+        let of_user = self.settings.as_ref().map(|all| {
+            let of_user = all.iter().filter(|(key, _)| !is_derived(key));
+            Vec::from_iter(of_user)
+        });
+        let settings = match of_user.as_deref() {
             None => vec![vec!["the settings of one run are not known".into()]],
             Some([]) => vec![vec!["the settings are the same".into()]],
             Some(all) => {

@@ -6,8 +6,8 @@ use std::time::{Duration, SystemTime};
 use anyhow::Result;
 use serde_json::{Value, json};
 
-use crate::config::{Config, Difference, Source, short};
-use crate::os::{self, Hold, Stamp, clock, harmless, number, steps_of_all};
+use crate::config::{Config, Difference, Source, is_derived, short};
+use crate::os::{self, Hold, Stamp, count, harmless, number, of_all, span};
 use crate::run::{Glance, read_metrics};
 
 /// The last rows of a table over which its speed is averaged.
@@ -128,11 +128,11 @@ impl Run {
             ..
         } = self.figures;
         let steps = match (env_steps, self.total_steps) {
-            (Some(made), Some(all)) => steps_of_all(made, all),
-            (Some(made), None) => made.to_string(),
+            (Some(made), Some(all)) => of_all(made, all),
+            (Some(made), None) => count(made as f64),
             (None, _) => "-".into(),
         };
-        let changed = self.changed.iter();
+        let changed = self.changed.iter().filter(|(key, _)| !is_derived(key));
         let settings = match (&self.problems[..], &self.config) {
             ([], None) => "no config.toml".into(),
             ([], _) => {
@@ -148,9 +148,9 @@ impl Run {
         vec![
             harmless(&name),
             self.state.name().into(),
-            self.left().map_or("-".into(), clock),
+            self.left().map_or("-".into(), span),
             steps,
-            number(steps_per_s, 0),
+            count(steps_per_s),
             number(goals, 2),
             number(best_goals, 2),
             harmless(&settings),

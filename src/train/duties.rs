@@ -251,6 +251,7 @@ impl Duties for Lead {
             goals: shown["goals"],
             drop_rate: shown["drop_rate"],
             evaluation: outcome.evaluation["goals"],
+            assisted: outcome.iteration.lesson.assist > 0.0,
         };
         self.report.iteration(
             session.agent.iteration,

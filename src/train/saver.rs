@@ -200,10 +200,18 @@ impl Saver {
 
     /// Writes the configuration and the versions into the folder.
     fn describe(&self) -> Result<()> {
-        let fork =
-            self.held.last.progress.fork.as_ref().map_or(String::new(), |Fork { from, iteration, env_steps }| {
-                format!("# Forked from {from:?} after {iteration} iterations, {env_steps} env steps.\n\n")
-            });
+        let fork = self.held.last.progress.fork.as_ref().map_or(
+            String::new(),
+            |Fork {
+                 from,
+                 iteration,
+                 env_steps,
+             }| {
+                format!(
+                    "# Forked from {from:?} after {iteration} iterations, {env_steps} steps.\n\n"
+                )
+            },
+        );
         self.held
             .folder
             .describe(&format!("{fork}{}", self.held.settings), &version())
@@ -275,7 +283,7 @@ impl Held {
     /// The progress of the training run as text.
     pub fn steps_made(&self) -> String {
         format!(
-            "{} iterations, {} env steps",
+            "{} iterations, {} steps",
             self.last.progress.iteration, self.last.progress.env_steps
         )
     }

@@ -122,7 +122,7 @@ fn a_fork_goes_on_under_its_own_settings_and_says_where_it_came_from() {
         .join("run/checkpoints/iteration-00000002.safetensors");
     assert_eq!(
         first,
-        format!("# Forked from {from:?} after 2 iterations, 256 env steps.")
+        format!("# Forked from {from:?} after 2 iterations, 256 steps.")
     );
     for set in [
         "horizon = 4.0\n",
@@ -152,7 +152,7 @@ fn a_fork_goes_on_under_its_own_settings_and_says_where_it_came_from() {
     succeeded(fork(folder, "fork", "next", &["--total-steps", "640"]));
     let again = config(folder, "next");
     assert!(
-        again.starts_with("# Forked from") && again.contains("after 6 iterations, 512 env steps"),
+        again.starts_with("# Forked from") && again.contains("after 6 iterations, 512 steps"),
         "{again}"
     );
     // A new training with these settings does not mention the fork.

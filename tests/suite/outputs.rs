@@ -371,15 +371,8 @@ fn a_name_that_is_no_text_is_resumed_as_the_program_says() {
     let said = stderr(&output);
     let advice = said.lines().last().unwrap().trim();
     // $'…' needs bash.
-    let steps: u64 = said
-        .split(" env steps")
-        .next()
-        .unwrap()
-        .rsplit(' ')
-        .next()
-        .unwrap()
-        .parse()
-        .unwrap();
+    let (_, made) = said.split_once(" iterations, ").unwrap();
+    let steps: u64 = made.split(' ').next().unwrap().parse().unwrap();
     let text = format!("{advice} --total-steps {}", steps + 128);
     succeeded(
         Command::new("bash")
