@@ -211,6 +211,7 @@ fn growth(rows: u64) -> i64 {
             &[],
             &Status {
                 assisted: false,
+                shared: false,
                 env_steps: row,
                 steps_per_s: 1e4,
                 goals: 0.5,

@@ -33,6 +33,8 @@ pub struct Status {
     pub evaluation: f64,
     /// Whether training helps with turning the object.
     pub assisted: bool,
+    /// Whether other programs use the machine.
+    pub shared: bool,
 }
 
 /// The progress of a training run.
@@ -71,6 +73,7 @@ impl StatusLine {
             drop_rate: unknown,
             evaluation: unknown,
             assisted: false,
+            shared: false,
         };
         Self {
             bar,
@@ -86,6 +89,7 @@ impl StatusLine {
     /// Shows the values of an iteration.
     pub fn show(&mut self, status: &Status) {
         self.shown.update(status);
+        self.shown.shared = is_shared();
         let left = self.time_left();
         if let Some(bar) = &self.bar {
             let width = usize::from(Term::stderr().size().1).saturating_sub(1);
@@ -101,7 +105,7 @@ impl StatusLine {
         }
     }
 
-    /// Estimates the time left at the pace of this session, including evaluations. Says if others use the machine.
+    /// Estimates the time left at the pace of this session, including evaluations.
     fn time_left(&self) -> String {
         let made = self
             .shown
@@ -111,12 +115,7 @@ impl StatusLine {
         let pace = self.begun.elapsed().as_secs_f64() / made as f64;
         let left = pace * self.total_steps.saturating_sub(self.shown.env_steps) as f64;
         let left = span(Duration::try_from_secs_f64(left).unwrap_or(Duration::MAX));
-        let shared = if is_shared() {
-            " on a shared machine"
-        } else {
-            ""
-        };
-        format!("{left} left{shared}")
+        format!("{left} left")
     }
 
     /// Prints a line above the progress line.
@@ -175,12 +174,16 @@ impl Status {
             "goals"
         };
         let per_cent = if self.drop_rate.is_nan() { "" } else { "%" };
-        vec![
+        let mut parts = vec![
             format!("{} steps/s", count(self.steps_per_s)),
             left.into(),
             format!("{goals} {}{evaluated}", number(self.goals, 2)),
             format!("drops {}{per_cent}", number(100.0 * self.drop_rate, 0)),
-        ]
+        ];
+        if self.shared {
+            parts.push("others use the machine".into());
+        }
+        parts
     }
 
     /// The line with the parts that fit into `width` columns.
@@ -265,12 +268,14 @@ mod tests {
             drop_rate: 0.335,
             evaluation: 5.75,
             assisted: false,
+            shared: false,
         };
         let left = span(Duration::from_secs(7533));
         let line = |width| status.line(100_000_000, &left, width);
         let short = "10 M of 100 M steps  12.3 k steps/s  2 h 5 min  goals 0.24 (eval 5.75)";
         assert_eq!(line(70), short);
-        assert_eq!(line(79), format!("{short}  drops 34%"));
+        assert_eq!(line(80), short);
+        assert_eq!(line(81), format!("{short}  drops 34%"));
         let few = Status {
             env_steps: 256,
             evaluation: f64::NAN,

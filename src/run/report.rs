@@ -253,6 +253,7 @@ mod tests {
     fn status(env_steps: u64) -> Status {
         Status {
             assisted: false,
+            shared: false,
             env_steps,
             steps_per_s: 10.0,
             goals: f64::NAN,

@@ -252,6 +252,7 @@ impl Duties for Lead {
             drop_rate: shown["drop_rate"],
             evaluation: outcome.evaluation["goals"],
             assisted: outcome.iteration.lesson.assist > 0.0,
+            shared: false,
         };
         self.report.iteration(
             session.agent.iteration,

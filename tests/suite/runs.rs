@@ -122,7 +122,7 @@ fn runs_are_listed_newest_first_with_steps_goals_and_settings_and_nothing_is_cha
     );
     for part in [
         " finished ",
-        " 256/256 ",
+        " 256 of 256 ",
         " env.num_envs=16 ",
         " ppo.hidden=[16,8] ",
         " run.seed=7",
