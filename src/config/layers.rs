@@ -769,7 +769,8 @@ mod tests {
                 "training.tolerance.step=5",
                 "did you mean training.tolerance.steps?",
             ),
-            ("ppo.lr=1", "configs/repose.toml lists all of them"),
+            ("ppo.lr=1", "did you mean ppo.learning_rate?"),
+            ("ppo.qqq=1", "configs/repose.toml lists all of them"),
             ("env.cube_size=1", "did you mean env.cube_size_scale?"),
             (
                 "randomization.mass=1",
