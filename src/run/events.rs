@@ -77,8 +77,8 @@ impl EventFile {
         self.write(What::session_log(session), first_step)?;
         if !settings.is_empty() {
             let settings = Content::tensor(text(format!("```\n{settings}\n```\n")));
-            self.summary([(SETTINGS, settings)].into_iter(), first_step)?;
-            self.values(vec![layout()], first_step)?;
+            let settings = value(SETTINGS, settings, self.undescribed.remove(SETTINGS));
+            self.values(vec![settings, layout()], first_step)?;
         }
         sync_folder(&self.path);
         Ok(())
@@ -241,7 +241,7 @@ mod tests {
         fs::write(&path, half).unwrap();
         for (last, expected) in [(40, 4), (25, 2)] {
             cut_off_after(place.path(), last).unwrap();
-            let steps: Vec<i64> = read(&path)[4..].iter().map(Event::get_step).collect();
+            let steps: Vec<i64> = read(&path)[3..].iter().map(Event::get_step).collect();
             assert_eq!(
                 steps,
                 (1..=expected).map(|step| 10 * step).collect::<Vec<i64>>()
@@ -268,7 +268,7 @@ mod tests {
             .unwrap()
             .path();
         let found = read(&path);
-        assert_eq!(found.len(), 6);
+        assert_eq!(found.len(), 5);
         assert_eq!(found[0].get_file_version(), "brain.Event:2");
         assert_eq!(
             (found[1].get_step(), found[1].get_session_log().get_status()),
@@ -294,13 +294,13 @@ mod tests {
             settings.get_tensor().get_string_val()[0],
             b"```\n[run]\nseed = 3\n\n```\n"
         );
-        let page = &found[3].get_summary().get_value()[0];
+        let page = &found[2].get_summary().get_value()[1];
         assert_eq!(plugin(page), "custom_scalars");
         let layout = &page.get_tensor().get_string_val()[0];
         let layout = Layout::parse_from_bytes(layout).unwrap();
         assert_eq!(layout.get_category()[0].get_title(), "Look at these first");
-        let values = found[4].get_summary().get_value();
-        assert_eq!((found[4].get_step(), values.len()), (9, 2));
+        let values = found[3].get_summary().get_value();
+        assert_eq!((found[3].get_step(), values.len()), (9, 2));
         assert_eq!(
             (values[0].get_tag(), values[0].get_simple_value()),
             ("reward/fall", 0.25)
@@ -323,7 +323,7 @@ mod tests {
             [2],
             "the data class"
         );
-        let again = &found[5].get_summary().get_value()[0];
+        let again = &found[4].get_summary().get_value()[0];
         assert!(!again.has_metadata() && again.get_simple_value() == 0.25);
     }
 }
