@@ -226,14 +226,14 @@ impl Trial<'_> {
         let mut group = Lanes::new(self, own);
         let mut results = Vec::with_capacity(count);
         for first in groups {
-            group.start(first, observer)?;
+            let started = group.start(first, observer)?;
             while group.lanes.iter().any(|lane| lane.running) {
                 if self.stop.load(Ordering::Relaxed) {
                     return Ok(None);
                 }
                 group.step(observer)?;
             }
-            let lanes = group.lanes.iter_mut();
+            let lanes = group.lanes[..started].iter_mut();
             results.extend(lanes.map(|lane| (lane.number, lane.episode())));
         }
         let mut all = exchange.all_gather(results).concat();
@@ -263,13 +263,15 @@ impl<'a> Lanes<'a> {
         }
     }
 
-    /// Starts the episodes from number `first` on. The last group may have fewer of them than lanes.
-    fn start(&mut self, first: usize, observer: &mut Observer) -> Result<()> {
+    /// Starts the episodes from number `first` on, and returns their number. The last group may have fewer of them than lanes.
+    fn start(&mut self, first: usize, observer: &mut Observer) -> Result<usize> {
         let episodes = self.trial.episodes;
-        self.lanes.truncate(episodes.first + episodes.count - first);
+        let left = episodes.first + episodes.count - first;
+        let started = left.min(self.lanes.len());
+        let lanes = &mut self.lanes[..started];
         let size = self.trial.task.spaces().observation_size;
         let rows = self.observations.par_chunks_exact_mut(size);
-        self.lanes
+        lanes
             .par_iter_mut()
             .zip(rows)
             .enumerate()
@@ -279,7 +281,7 @@ impl<'a> Lanes<'a> {
                 });
             });
         let rows = self.observations.chunks_exact(size);
-        for (lane, observation) in self.lanes.iter().zip(rows) {
+        for (lane, observation) in lanes.iter().zip(rows) {
             observer(Moment {
                 episode: lane.number,
                 env: &lane.env,
@@ -287,7 +289,7 @@ impl<'a> Lanes<'a> {
                 step: None,
             })?;
         }
-        Ok(())
+        Ok(started)
     }
 
     /// Takes one step in each lane whose episode has not ended.
