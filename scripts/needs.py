@@ -23,7 +23,7 @@ def of_linux(content):
     """Returns the newest version of glibc whose symbols this ELF file names, as text, and whether that is promised."""
     found = [tuple(map(int, version.split(b"."))) for version in re.findall(rb"\0GLIBC_(\d+\.\d+)", content)]
     newest = max(found, default=(0, 0))
-    return f"glibc {newest[0]}.{newest[1]}", newest <= GLIBC
+    return f"glibc {newest[0]}.{newest[1]}", bool(found) and newest <= GLIBC
 
 
 def slices(content):

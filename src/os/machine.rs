@@ -1,7 +1,6 @@
 //! The machine that this process runs on: what several processes must know about each other's machines.
 
 use std::fs;
-use std::thread::available_parallelism;
 
 use rustix::system::uname;
 use rustix::time::{ClockId, clock_gettime};
@@ -45,8 +44,7 @@ pub fn processor_seconds() -> f64 {
 pub fn is_shared() -> bool {
     let load = fs::read_to_string("/proc/loadavg").unwrap_or_default();
     let waiting = load.split(' ').next().and_then(|load| load.parse().ok());
-    let processors = available_parallelism().map_or(1, usize::from);
-    waiting.is_some_and(|waiting: f64| waiting > 1.5 * processors as f64)
+    waiting.is_some_and(|waiting: f64| waiting > 1.5 * Machine::this().processors as f64)
 }
 
 /// The number of elements of a list as the kernel writes it, e.g. 5 for `0-3,8`.
