@@ -67,16 +67,13 @@ impl Task {
             size: config.cube_size_scale,
             shifts: config.cube_com != [0.0; 3],
             adds_goal: parts.goal.is_empty().then_some(GOAL),
+            physics_only: true,
             ..plain
         };
         if parts.goal.is_empty() {
             parts.goal = GOAL.into();
         }
-        let nominal = if compilation.keeps_all() {
-            as_it_is
-        } else {
-            Scene::load(file, &compilation)?
-        };
+        let nominal = Scene::load(file, &compilation)?;
         let mut hand = Hand::bind(&nominal, parts).with_context(|| origin(file))?;
         let scene = nominal.varied(&Physics::of_task(&config).changes(&hand));
         hand.object.inertia *= config.cube_mass_scale;

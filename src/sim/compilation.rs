@@ -22,6 +22,7 @@ use serde::{Deserialize, Serialize};
 use super::constants::*;
 use super::fatal::quieten_mujoco;
 use super::files::{SceneFiles, scene_files};
+use super::fingerprint::fingerprint;
 use super::placing::{frames_within, geoms_within};
 use crate::quat;
 
@@ -59,6 +60,8 @@ pub struct Compilation {
     pub shifts: bool,
     /// The name of a mocap body that is added to show the goal: it looks like the object, and touches nothing.
     pub adds_goal: Option<&'static str>,
+    /// Whether it leaves out what is only seen, such as meshes that touch nothing, and textures.
+    pub physics_only: bool,
     /// The scene in memory. What is not there is read from its file.
     pub files: Arc<SceneFiles>,
 }
@@ -76,6 +79,7 @@ impl Compilation {
             size: 1.0,
             shifts: false,
             adds_goal: None,
+            physics_only: false,
             files: Arc::default(),
         }
     }
@@ -103,8 +107,8 @@ impl Compilation {
         Ok(if is_same { in_memory } else { self })
     }
 
-    /// Whether it keeps all of a scene but its options.
-    pub fn keeps_all(&self) -> bool {
+    /// Whether it keeps all of a scene but its options and its looks.
+    fn keeps_all(&self) -> bool {
         self.size == 1.0 && !self.shifts && self.adds_goal.is_none()
     }
 
@@ -126,7 +130,20 @@ impl Compilation {
             );
             scene_files(file)?;
         }
-        self.finish(self.spec(file)?)
+        let whole = self.finish(self.spec(file)?)?;
+        if !self.physics_only {
+            return Ok(whole);
+        }
+        let mut spec = self.spec(file)?;
+        spec.discard_visual_with_vfs(&self.files.for_mujoco())
+            .map_err(refused)?;
+        let light = self.finish(spec)?;
+        // They differ where something refers to shapes by their numbers, such as a tendon that winds around one.
+        Ok(if fingerprint(&light) == fingerprint(&whole) {
+            light
+        } else {
+            whole
+        })
     }
 
     /// Compiles a scene that was read.
@@ -180,6 +197,7 @@ impl Compilation {
         if let Some(goal) = self.adds_goal {
             let without_goal = Self {
                 adds_goal: None,
+                physics_only: false,
                 ..self.clone()
             };
             add_goal(&mut spec, &without_goal.compile(file)?, name, goal)?;

@@ -26,47 +26,51 @@ impl Scene {
     /// nothing are left out, and so are sensors, keyframes and plugins. The quantities of the second list count only where they are
     /// unusual, so that the checksum of other scenes stays the same when the list grows.
     pub fn fingerprint(&self) -> String {
-        let model = &*self.model;
-        let mut hasher = crc32fast::Hasher::new();
-        let mut take = |parts: &[&dyn Debug]| {
-            parts
-                .iter()
-                .for_each(|part| hasher.update(format!("{part:?}\n").as_bytes()))
-        };
-        take(arrays! { model:
-            opt qpos0 qpos_spring
-            body_parentid body_mocapid body_pos body_quat body_ipos body_iquat body_mass body_inertia body_gravcomp
-            jnt_type jnt_bodyid jnt_pos jnt_axis jnt_limited jnt_range jnt_margin jnt_stiffness jnt_solref jnt_solimp
-            jnt_actfrclimited jnt_actfrcrange jnt_actgravcomp
-            dof_armature dof_damping dof_frictionloss dof_solref dof_solimp
-        });
-        take_geoms(model, &mut take);
-        take(arrays! { model:
-            site_bodyid site_pos site_quat
-            wrap_type wrap_objid wrap_prm tendon_adr tendon_num tendon_limited tendon_range tendon_stiffness tendon_damping
-            tendon_frictionloss tendon_lengthspring tendon_armature
-            actuator_trntype actuator_trnid actuator_gear actuator_dyntype actuator_dynprm actuator_gaintype actuator_gainprm
-            actuator_biastype actuator_biasprm actuator_ctrllimited actuator_ctrlrange actuator_forcelimited
-            actuator_forcerange
-            eq_type eq_obj1id eq_obj2id eq_active0 eq_data eq_solref eq_solimp exclude_signature
-            pair_signature pair_dim pair_friction pair_solref pair_margin pair_gap
-        });
-        let none = [0.0; 2];
-        let solref = [0.02, 1.0];
-        let solimp = [0.9, 0.95, 0.001, 0.5, 2.0];
-        let unusual = unusual! { model:
-            actuator_armature 0.0, actuator_damping 0.0, actuator_dampingpoly none, dof_dampingpoly none, jnt_stiffnesspoly none,
-            tendon_dampingpoly none, tendon_stiffnesspoly none, tendon_solref_lim solref, tendon_solimp_lim solimp,
-            tendon_solref_fri solref, tendon_solimp_fri solimp, tendon_margin 0.0, tendon_actfrclimited false,
-            pair_solimp solimp, pair_solreffriction none
-        };
-        for (name, array) in unusual {
-            array
-                .into_iter()
-                .for_each(|array| hasher.update(format!("{name} {array}\n").as_bytes()));
-        }
-        format!("{:08x}", hasher.finalize())
+        fingerprint(&self.model)
     }
+}
+
+/// The checksum of a compiled scene.
+pub(super) fn fingerprint(model: &MjModel) -> String {
+    let mut hasher = crc32fast::Hasher::new();
+    let mut take = |parts: &[&dyn Debug]| {
+        parts
+            .iter()
+            .for_each(|part| hasher.update(format!("{part:?}\n").as_bytes()))
+    };
+    take(arrays! { model:
+        opt qpos0 qpos_spring
+        body_parentid body_mocapid body_pos body_quat body_ipos body_iquat body_mass body_inertia body_gravcomp
+        jnt_type jnt_bodyid jnt_pos jnt_axis jnt_limited jnt_range jnt_margin jnt_stiffness jnt_solref jnt_solimp
+        jnt_actfrclimited jnt_actfrcrange jnt_actgravcomp
+        dof_armature dof_damping dof_frictionloss dof_solref dof_solimp
+    });
+    take_geoms(model, &mut take);
+    take(arrays! { model:
+        site_bodyid site_pos site_quat
+        wrap_type wrap_objid wrap_prm tendon_adr tendon_num tendon_limited tendon_range tendon_stiffness tendon_damping
+        tendon_frictionloss tendon_lengthspring tendon_armature
+        actuator_trntype actuator_trnid actuator_gear actuator_dyntype actuator_dynprm actuator_gaintype actuator_gainprm
+        actuator_biastype actuator_biasprm actuator_ctrllimited actuator_ctrlrange actuator_forcelimited
+        actuator_forcerange
+        eq_type eq_obj1id eq_obj2id eq_active0 eq_data eq_solref eq_solimp exclude_signature
+        pair_signature pair_dim pair_friction pair_solref pair_margin pair_gap
+    });
+    let none = [0.0; 2];
+    let solref = [0.02, 1.0];
+    let solimp = [0.9, 0.95, 0.001, 0.5, 2.0];
+    let unusual = unusual! { model:
+        actuator_armature 0.0, actuator_damping 0.0, actuator_dampingpoly none, dof_dampingpoly none, jnt_stiffnesspoly none,
+        tendon_dampingpoly none, tendon_stiffnesspoly none, tendon_solref_lim solref, tendon_solimp_lim solimp,
+        tendon_solref_fri solref, tendon_solimp_fri solimp, tendon_margin 0.0, tendon_actfrclimited false,
+        pair_solimp solimp, pair_solreffriction none
+    };
+    for (name, array) in unusual {
+        array
+            .into_iter()
+            .for_each(|array| hasher.update(format!("{name} {array}\n").as_bytes()));
+    }
+    format!("{:08x}", hasher.finalize())
 }
 
 /// Takes the shapes that can touch something.

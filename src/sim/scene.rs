@@ -112,6 +112,10 @@ impl Scene {
         compilation: &Compilation,
         look: &Look,
     ) -> Result<Self> {
+        let compilation = &Compilation {
+            physics_only: false,
+            ..compilation.clone()
+        };
         let scene = Self::load(file, compilation)?;
         let changed = match file {
             None => look

@@ -6,17 +6,23 @@ use anyhow::{Result, ensure};
 use mujoco_rs::prelude::{MjData, MjModel};
 
 use super::constants::*;
+use super::variation::Variation;
 use super::{Actuator, Body, Frame, FreeJoint, Mocap, Scene};
 use crate::quat::{self, Quat};
 
 /// MuJoCo's name for everything that the next step depends on.
 const EVERYTHING: u32 = mjSTATE_INTEGRATION as u32;
 
+/// What MuJoCo computes of one world.
+pub(super) type Data = MjData<Arc<MjModel>>;
+
 /// The state of one world. Body positions, velocities and joints always belong to the same instant.
 pub struct Simulation {
-    pub(super) data: MjData<Arc<MjModel>>,
-    /// A model of its own that it does not use at the moment.
-    pub(super) spare: Option<MjModel>,
+    pub(super) data: Data,
+    /// The scene that it began in, which it shares with others.
+    pub(super) nominal: Arc<MjModel>,
+    /// How its physics differ from that scene.
+    pub(super) variation: Option<Variation>,
 }
 
 impl Simulation {
@@ -24,7 +30,8 @@ impl Simulation {
     pub fn new(scene: &Scene) -> Self {
         Self {
             data: MjData::new(scene.model.clone()),
-            spare: None,
+            nominal: scene.model.clone(),
+            variation: None,
         }
     }
 
@@ -35,7 +42,7 @@ impl Simulation {
 
     /// Updates body positions and velocities to `qpos` and `qvel`.
     pub fn refresh(&mut self) {
-        self.data.step1();
+        self.compute(|data| data.step1());
     }
 
     /// Takes `substeps` physics steps with constant controls. Returns whether the state diverged: it or a control was not finite or
@@ -45,46 +52,28 @@ impl Simulation {
     /// same computation and end with both at the same instant.
     #[must_use]
     pub fn step(&mut self, substeps: usize) -> bool {
-        for _ in 0..substeps {
-            self.data.step2();
-            self.data.step1();
-            if self.diverged() {
-                return true;
-            }
-        }
-        false
+        self.compute(|data| diverges(data, substeps))
     }
 
     /// Takes `substeps` physics steps as [`Simulation::step`] does. After the last one, only the poses and the velocities of the bodies are
     /// up to date, and the next step needs a [`Simulation::refresh`].
     #[must_use]
     pub fn step_to_observe(&mut self, substeps: usize) -> bool {
-        if self.step(substeps - 1) {
-            return true;
-        }
-        self.data.step2();
-        self.data.kinematics();
-        self.data.com_pos();
-        self.data.com_vel();
-        self.diverged()
+        self.compute(|data| {
+            if diverges(data, substeps - 1) {
+                return true;
+            }
+            data.step2();
+            data.kinematics();
+            data.com_pos();
+            data.com_vel();
+            diverged(data)
+        })
     }
 
     /// Takes `substeps` steps of plain `mj_step`: the physics alone, for comparison. The bodies are one substep behind the joints.
     pub fn step_whole(&mut self, substeps: usize) {
-        (0..substeps).for_each(|_| self.data.step());
-    }
-
-    /// Whether the state diverged. MuJoCo resets it silently within the step. Only its warning counters show it.
-    fn diverged(&self) -> bool {
-        let warnings = self.data.warning();
-        [
-            mjWARN_BADQPOS,
-            mjWARN_BADQVEL,
-            mjWARN_BADQACC,
-            mjWARN_BADCTRL,
-        ]
-        .iter()
-        .any(|&kind| warnings[kind as usize].number > 0)
+        self.compute(|data| (0..substeps).for_each(|_| data.step()));
     }
 
     /// The generalised positions, in the model's order: rad, m, and quaternions.
@@ -166,7 +155,10 @@ impl Simulation {
         self.data.reset();
         self.data.set_state(numbers, EVERYTHING)?;
         self.refresh();
-        ensure!(!self.diverged(), "MuJoCo cannot resume from this state");
+        ensure!(
+            !diverged(&self.data),
+            "MuJoCo cannot resume from this state"
+        );
         Ok(())
     }
 
@@ -253,6 +245,28 @@ impl Simulation {
         self.data.mocap_pos_mut()[id] = position;
         self.data.mocap_quat_mut()[id] = orientation;
     }
+}
+
+/// Takes steps as [`Simulation::step`] does.
+fn diverges(data: &mut Data, substeps: usize) -> bool {
+    (0..substeps).any(|_| {
+        data.step2();
+        data.step1();
+        diverged(data)
+    })
+}
+
+/// Whether the state diverged. MuJoCo resets it silently within the step. Only its warning counters show it.
+fn diverged(data: &Data) -> bool {
+    let warnings = data.warning();
+    [
+        mjWARN_BADQPOS,
+        mjWARN_BADQVEL,
+        mjWARN_BADQACC,
+        mjWARN_BADCTRL,
+    ]
+    .iter()
+    .any(|&kind| warnings[kind as usize].number > 0)
 }
 
 /// The pose of a frame in the world.

@@ -8,13 +8,17 @@
     reason = "two things that the wrapper does not let do; each comment says why it is sound"
 )]
 
-use std::cell::RefCell;
+use std::cell::Cell;
+use std::mem;
+use std::ops::Range;
+use std::slice;
 use std::sync::Arc;
 
-use mujoco_rs::mujoco_c::mj_copyModel;
+use mujoco_rs::mujoco_c::{mj_copyModel, mj_setConst, mjOption, mjStatistic};
 use mujoco_rs::prelude::{MjData, MjModel};
 
 use super::placing::frames_within;
+use super::simulation::Data;
 use super::{Actuator, Body, Hinge, Scene, Simulation};
 
 /// A change of the physics of a scene.
@@ -81,8 +85,10 @@ impl Change {
 impl Scene {
     /// This scene with these changes.
     pub fn varied(&self, changes: &[Change]) -> Self {
+        let mut model = (*self.model).clone();
+        change(&mut model, changes, &mut MjData::new(self.model.clone()));
         Self {
-            model: Arc::new(changed((*self.model).clone(), changes)),
+            model: Arc::new(model),
             ..*self
         }
     }
@@ -93,45 +99,158 @@ impl Scene {
     }
 }
 
+/// How the scene of one simulation differs from the scene that many share: only what differs is kept.
+pub(super) struct Variation {
+    /// Where the arrays of the two models differ, in bytes.
+    places: Vec<Range<usize>>,
+    /// What stands there, place after place.
+    bytes: Vec<u8>,
+    options: mjOption,
+    statistics: mjStatistic,
+}
+
+/// The model that the varied simulations of a thread take turns to use. A scene with meshes is large, so they have no models of
+/// their own.
+struct Varied {
+    shared: Arc<MjModel>,
+    /// It differs from the shared model in no other `places`.
+    model: MjModel,
+    places: Vec<Range<usize>>,
+}
+
+/// The numbers of bytes that are compared at once.
+const BLOCK: usize = 128;
+
+thread_local! {
+    static VARIED: Cell<Option<Varied>> = const { Cell::new(None) };
+}
+
+impl Varied {
+    /// The model of this thread for variations of a shared one.
+    fn take(shared: &Arc<MjModel>) -> Self {
+        let known = VARIED
+            .take()
+            .filter(|known| Arc::ptr_eq(&known.shared, shared));
+        known.unwrap_or_else(|| Self {
+            model: (**shared).clone(),
+            shared: shared.clone(),
+            places: Vec::new(),
+        })
+    }
+
+    /// The same place with the shared model but for a variation.
+    fn with(mut self, variation: &Variation) -> Self {
+        let model = arrays_mut(&mut self.model);
+        let shared = arrays(&self.shared);
+        for place in mem::take(&mut self.places) {
+            model[place.clone()].copy_from_slice(&shared[place]);
+        }
+        let mut bytes = &variation.bytes[..];
+        for place in &variation.places {
+            let (here, rest) = bytes.split_at(place.len());
+            model[place.clone()].copy_from_slice(here);
+            bytes = rest;
+        }
+        self.places.clone_from(&variation.places);
+        *self.model.opt_mut() = variation.options.clone();
+        *self.model.stat_mut() = variation.statistics.clone();
+        self
+    }
+
+    /// How the model differs from the shared one.
+    fn variation(&self) -> Variation {
+        let model = arrays(&self.model);
+        let mut places: Vec<Range<usize>> = Vec::new();
+        let blocks = arrays(&self.shared).chunks(BLOCK).zip(model.chunks(BLOCK));
+        for (i, (_, block)) in blocks.enumerate().filter(|(_, (a, b))| a != b) {
+            let start = i * BLOCK;
+            match places.last_mut().filter(|last| last.end == start) {
+                Some(last) => last.end += block.len(),
+                None => places.push(start..start + block.len()),
+            }
+        }
+        Variation {
+            bytes: places
+                .iter()
+                .flat_map(|place| &model[place.clone()])
+                .copied()
+                .collect(),
+            places,
+            options: self.model.opt().clone(),
+            statistics: self.model.stat().clone(),
+        }
+    }
+}
+
+/// The bytes of all arrays of a model.
+fn arrays(model: &MjModel) -> &[u8] {
+    let model = model.ffi();
+    // SAFETY: MuJoCo keeps all arrays of a model in one buffer of this size, which it fills when it makes the model.
+    unsafe { slice::from_raw_parts(model.buffer.cast(), model.nbuffer as usize) }
+}
+
+/// The same, to be overwritten by those of a model of the same structure.
+fn arrays_mut(model: &mut MjModel) -> &mut [u8] {
+    // SAFETY: as above; nothing else refers to the model meanwhile.
+    unsafe {
+        let model = model.ffi_mut();
+        slice::from_raw_parts_mut(model.buffer.cast(), model.nbuffer as usize)
+    }
+}
+
 impl Simulation {
-    /// Continues in a scene with these changes. The state must be reset after it. A scene with meshes is large, so the simulation
-    /// overwrites its own model rather than making another one in each episode.
+    /// Continues in a scene with these changes. The state must be reset after it.
     ///
     /// # Panics
     /// Panics if the structure of the scene is another one.
     pub fn change_scene(&mut self, scene: &Scene, changes: &[Change]) {
-        let before = self.data.swap_model(scene.model.clone());
-        self.spare = Arc::into_inner(before).or_else(|| self.spare.take());
+        self.data.swap_model(scene.model.clone());
+        self.variation = None;
         if changes.is_empty() {
             return;
         }
-        let mut model = self.spare.take().unwrap_or_else(|| (*scene.model).clone());
+        let mut varied = Varied::take(&self.nominal);
         // SAFETY: MuJoCo copies one model over another of the same sizes. It checks the sizes of their buffers itself, and ends the
-        // process if they differ. Both have been models of this simulation, which takes no others.
-        unsafe { mj_copyModel(model.ffi_mut(), scene.model.ffi()) };
-        self.data.swap_model(Arc::new(changed(model, changes)));
+        // process if they differ. The data could not have taken a scene of another structure.
+        unsafe { mj_copyModel(varied.model.ffi_mut(), scene.model.ffi()) };
+        change(&mut varied.model, changes, &mut self.data);
+        let variation = varied.variation();
+        varied.places.clone_from(&variation.places);
+        self.variation = Some(variation);
+        VARIED.set(Some(varied));
+    }
+
+    /// Computes with the physics of this simulation.
+    pub(super) fn compute<T>(&mut self, act: impl FnOnce(&mut Data) -> T) -> T {
+        let Some(variation) = &self.variation else {
+            return act(&mut self.data);
+        };
+        let Varied {
+            shared,
+            model,
+            places,
+        } = Varied::take(&self.nominal).with(variation);
+        // SAFETY: the model has the structure of the one that it stands in for.
+        let resting = unsafe { self.data.swap_model_unchecked(Arc::new(model)) };
+        let result = act(&mut self.data);
+        // SAFETY: as above.
+        let model = unsafe { self.data.swap_model_unchecked(resting) };
+        VARIED.set(Arc::into_inner(model).map(|model| Varied {
+            shared,
+            model,
+            places,
+        }));
+        result
     }
 }
 
-thread_local! {
-    /// What updates the constants of a model, from the last time.
-    static WORKSPACE: RefCell<Option<MjData<Box<MjModel>>>> = const { RefCell::new(None) };
-}
-
-/// A model with these changes, and with what MuJoCo derives from masses at compile time.
-fn changed(mut model: MjModel, changes: &[Change]) -> MjModel {
-    changes.iter().for_each(|change| change.apply(&mut model));
-    if !changes.iter().any(Change::is_structural) {
-        return model;
+/// Makes these changes in a model, and what MuJoCo derives from masses at compile time. Overwrites the state of the data.
+fn change(model: &mut MjModel, changes: &[Change], data: &mut Data) {
+    changes.iter().for_each(|change| change.apply(model));
+    if changes.iter().any(Change::is_structural) {
+        // SAFETY: the data is of a model of the same structure.
+        unsafe { mj_setConst(model.ffi_mut(), data.ffi_mut()) };
     }
-    WORKSPACE.with_borrow_mut(|kept| {
-        let fitting = kept.take_if(|data| data.model().is_compatible_with_model(&model));
-        let workspace =
-            kept.insert(fitting.unwrap_or_else(|| MjData::new(Box::new(model.clone()))));
-        let between = workspace.swap_model(Box::new(model));
-        workspace.set_const();
-        *workspace.swap_model(between)
-    })
 }
 
 #[cfg(test)]
@@ -141,26 +260,52 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_simulation_overwrites_its_own_model_in_each_varied_episode() {
-        let scene = Scene::load(None, &Compilation::plain(0.01, Cone::Scene)).unwrap();
+    fn simulations_of_a_thread_share_a_model_and_keep_what_differs() {
+        let compilation = Compilation {
+            object: "cube".into(),
+            ..Compilation::plain(0.01, Cone::Scene)
+        };
+        let scene = Scene::load(None, &compilation).unwrap();
+        let larger = Scene::load(
+            None,
+            &Compilation {
+                size: 1.2,
+                ..compilation
+            },
+        )
+        .unwrap();
         let cube = scene.body("cube").unwrap();
-        let mut simulation = Simulation::new(&scene);
+        let changes = |factor| [Change::Mass(cube, factor), Change::Friction(factor)];
+        let episodes = [
+            (&scene, Vec::from(changes(2.0))),
+            (&larger, Vec::from(changes(0.5))),
+            (&scene, vec![Change::Gravity([0.0, 0.0, 1.0])]),
+            (&larger, vec![]),
+        ];
+        let mut simulations = episodes.clone().map(|(of, changes)| {
+            let mut simulation = Simulation::new(&scene);
+            simulation.change_scene(of, &changes);
+            simulation
+        });
         let mut places = Vec::new();
-        for factor in [2.0, 1.0, 0.5, 2.0] {
-            let changes = [Change::Mass(cube, factor), Change::Friction(factor)];
-            let drawn = if factor == 1.0 { &[][..] } else { &changes };
-            simulation.change_scene(&scene, drawn);
-            let model = simulation.data.model();
-            let own = Scene {
-                model: Arc::new(model.clone()),
-                ..scene
-            };
-            assert_eq!(own.fingerprint(), scene.varied(drawn).fingerprint());
-            places.push(std::ptr::from_ref(model.ffi()));
+        for _ in 0..2 {
+            for (simulation, (of, changes)) in simulations.iter_mut().zip(&episodes) {
+                let own = of.varied(changes).model;
+                simulation.compute(|data| {
+                    let model = data.model();
+                    assert!(arrays(model) == arrays(&own));
+                    let [options, expected] =
+                        [model, &own].map(|model| format!("{:?}", model.opt()));
+                    assert_eq!(options, expected);
+                    places.push(std::ptr::from_ref(model.ffi()));
+                });
+            }
         }
-        let shared = std::ptr::from_ref(scene.model.ffi());
-        assert_eq!(places, [places[0], shared, places[0], places[0]]);
-        assert_ne!(places[0], shared);
+        let resting = std::ptr::from_ref(larger.model.ffi());
+        assert_eq!(places[..4], [places[0], places[0], places[0], resting]);
+        assert_eq!(places[..4], places[4..]);
+        let kept = simulations[0].variation.as_ref().unwrap().bytes.len();
+        assert!(kept < arrays(&scene.model).len() / 10, "{kept}");
     }
 
     #[test]
