@@ -7,6 +7,7 @@ mod http;
 mod interrupt;
 mod lock;
 mod machine;
+pub mod memory;
 mod meshes;
 mod output;
 mod pip;

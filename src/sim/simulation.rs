@@ -99,7 +99,7 @@ impl Simulation {
     /// Moves each joint that follows another by an equality constraint to where the constraint wants it. Returns whether all these
     /// constraints hold then. [`Simulation::refresh`] must follow.
     pub fn follow(&mut self) -> bool {
-        let model = self.data.model().clone();
+        let model = self.nominal.clone();
         let ties: Vec<_> = ids(model.neq())
             .filter(|&i| model.eq_type()[i] == mjEQ_JOINT && model.eq_active0()[i])
             .collect();

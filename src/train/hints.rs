@@ -9,9 +9,6 @@ const SMALL_MINIBATCH: usize = 1024;
 /// The smallest weight of the task's reward at which its scales matter.
 const LITTLE: f64 = 0.1;
 
-/// The memory for the models of randomised environments above which there is a note, bytes.
-const MUCH: usize = 2 << 30;
-
 /// Settings that another one leaves without effect: the beginnings of their keys, the other one, and its largest value that does so.
 const WITHOUT_EFFECT: [(&str, &str, f64); 6] = [
     (
@@ -26,8 +23,8 @@ const WITHOUT_EFFECT: [(&str, &str, f64); 6] = [
     ("ppo.away_range", "ppo.away_std", 0.0),
 ];
 
-/// The notes about these settings, compared with the `default`, for a scene of this size in bytes.
-pub fn hints(config: &Config, args: &TrainArgs, default: &Config, scene: usize) -> Vec<String> {
+/// The notes about these settings, compared with the `default`.
+pub fn hints(config: &Config, args: &TrainArgs, default: &Config) -> Vec<String> {
     let mut hints = Vec::from_iter(of_ramps(config));
     let samples = config.samples_per_minibatch();
     if samples < SMALL_MINIBATCH {
@@ -44,17 +41,6 @@ pub fn hints(config: &Config, args: &TrainArgs, default: &Config, scene: usize) 
         ));
     }
     hints.extend(without_effect(config, default));
-    let models = scene.saturating_mul(config.env.num_envs);
-    let share = config.randomization.share;
-    if reached(config, "randomization.share") > 0.0 && models > MUCH {
-        let gib = models as f64 / f64::from(1 << 30);
-        hints.push(format!(
-            "[randomization]: each of {} environments gets its own model of this scene, from {} steps on: {gib:.1} GiB in total \
-             (randomization.share=0 avoids this)",
-            config.env.num_envs,
-            if share.at(0) > 0.0 { 0 } else { share.after }
-        ));
-    }
     hints
 }
 
@@ -115,7 +101,7 @@ mod tests {
     fn hints_for(sets: &[&str]) -> Vec<String> {
         let sets: Vec<Override> = sets.iter().map(|set| set.parse().unwrap()).collect();
         let config = Settings::new().sets(&sets).resolve().unwrap();
-        hints(&config, &TrainArgs::default(), &Config::default(), 1 << 20)
+        hints(&config, &TrainArgs::default(), &Config::default())
     }
 
     #[test]
@@ -142,20 +128,6 @@ mod tests {
             "{line}"
         );
         assert!(hints_for(&["env.dist_reward_scale=-20", "training.task_reward=1"]).is_empty());
-        let [line] = &hints_for(&["env.num_envs=8192"])[..] else {
-            panic!("one line")
-        };
-        assert!(
-            line.contains("8192 environments gets its own model of this scene, from 40000000 steps on: 8.0 GiB"),
-            "{line}"
-        );
-        assert!(hints_for(&["env.num_envs=8192", "randomization.share=0"]).is_empty());
-        let [line] = &hints_for(&["env.num_envs=8192", "randomization.share.from=0.2"])[..] else {
-            panic!("one line")
-        };
-        assert!(line.contains("from 0 steps on"), "{line}");
-        let short = hints_for(&["env.num_envs=8192", "run.total_steps=30_000_000"]);
-        assert!(!short.concat().contains("own model"), "it ends before");
         let [line] = &hints_for(&["randomization.share={after=200_000_000}"])[..] else {
             panic!("one line")
         };
@@ -226,7 +198,7 @@ mod tests {
                 init: Some("builtin".into()),
                 ..TrainArgs::default()
             };
-            assert_eq!(hints(&config, &args, &default, 1 << 19), [""; 0]);
+            assert_eq!(hints(&config, &args, &default), [""; 0]);
         }
     }
 }

@@ -4,6 +4,7 @@ mod duties;
 mod hints;
 mod lockstep;
 mod log;
+mod memory;
 mod mobility;
 mod outcome;
 mod saver;
@@ -27,6 +28,7 @@ use duties::{Duties, Follower, Lead};
 use hints::hints;
 use lockstep::Stop;
 use log::histograms;
+use memory::need;
 use mobility::mobility;
 use outcome::Outcome;
 use session::Session;
@@ -66,14 +68,23 @@ fn lead(args: &TrainArgs, requests: &Requests, exchange: &Exchange) -> Result<Ex
     requests.wait_for_end();
     say!("run folder: {place}");
     session.task.say_warnings();
+    let [needed, has] = need(&session);
+    if needed > has {
+        say!(
+            "warning: this training needs about {needed:.1} GiB of memory, but this machine has {has:.1} GiB: fewer environments \
+             (env.num_envs) need less"
+        );
+    }
     if !args.quiet {
         let default = Config::default();
         let mut notes = session.task.notes();
         if session.config.env.model_file().is_some() && args.resume.is_none() {
             notes.push(mobility(&session.task, &default.env));
         }
-        let size = session.task.scene.size();
-        notes.extend(hints(&session.config, args, &default, size));
+        notes.extend(hints(&session.config, args, &default));
+        notes.push(format!(
+            "memory: at most about {needed:.1} GiB; this machine has {has:.1} GiB"
+        ));
         for note in notes {
             say!("note: {note}");
         }
@@ -320,6 +331,23 @@ mod tests {
         .unwrap();
         let loaded = plan.load_task().unwrap();
         Session::new(plan, loaded, Exchange::alone(1)).unwrap()
+    }
+
+    #[test]
+    fn the_memory_that_is_said_grows_with_the_longest_rollout_and_is_less_than_a_machine_has() {
+        let needed = |horizon: &str| {
+            let sets = [
+                "env.num_envs=8".parse().unwrap(),
+                format!("ppo.horizon={horizon}").parse().unwrap(),
+            ];
+            need(&from_scratch(&sets))
+        };
+        let [short, has] = needed("16");
+        let [long, _] = needed("{from=16,to=160000,steps=1000}");
+        let samples = 8.0 * (160_000 - 16) as f64;
+        let of_samples = samples * 4.0 * (157 + 2 * 20 + 8) as f64 / f64::from(1 << 30);
+        assert!((long - short) / of_samples - 1.0 < 0.1 && long > short + of_samples);
+        assert!(0.0 < short && short < has, "{short} {has}");
     }
 
     fn saver_of(session: &Session, place: (RunFolder, Locked)) -> Saver {
