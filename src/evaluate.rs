@@ -386,9 +386,9 @@ impl Actor<'_> {
             match self {
                 Actor::Mean(_) | Actor::Outside(_) => {}
                 Actor::Stochastic(frozen) => {
-                    for action in row {
+                    for (action, log_std) in row.iter_mut().zip(&frozen.policy.log_std) {
                         let drawn: f32 = StandardNormal.sample(&mut lane.noise);
-                        *action += frozen.policy.std() * drawn;
+                        *action += log_std.exp() * drawn;
                     }
                 }
                 Actor::Zero => row.fill(0.0),

@@ -194,6 +194,9 @@ impl Loaded {
         Ok(Self {
             name: match &origin {
                 PolicySource::BuiltIn(policy) => policy.title.to_owned(),
+                PolicySource::File(path) if !policy.has_critic => {
+                    format!("{}, learnt elsewhere", path.display())
+                }
                 PolicySource::File(path) => format!(
                     "{}, {} control steps",
                     path.display(),

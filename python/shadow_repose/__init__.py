@@ -22,11 +22,12 @@ if TYPE_CHECKING:
     from typing import Any
 
     from . import _native
-    from ._policy import Policy, evaluate
+    from ._policy import Normalizer, Policy, evaluate
     from ._program import program
+    from ._show import show
     from .envs import Env, VectorEnv
 
-__all__ = ["Env", "Policy", "VectorEnv", "evaluate", "program"]
+__all__ = ["Env", "Normalizer", "Policy", "VectorEnv", "evaluate", "program", "show"]
 
 
 def _expect_avx(facts: str = "/proc/cpuinfo") -> None:
@@ -84,7 +85,10 @@ if "gymnasium" in sys.modules:
     register()
 
 
-_PLACES = {"Env": "envs", "VectorEnv": "envs", "Policy": "_policy", "evaluate": "_policy", "program": "_program"}
+_PLACES = {
+    "Env": "envs", "Normalizer": "_policy", "Policy": "_policy", "VectorEnv": "envs", "evaluate": "_policy", "program": "_program",
+    "show": "_show",
+}  # fmt: skip
 
 
 def __getattr__(name: str) -> Any:

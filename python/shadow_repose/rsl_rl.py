@@ -5,7 +5,9 @@
     from shadow_repose.rsl_rl import RslRlVecEnv
 
     envs = RslRlVecEnv(VectorEnv(1024, training=True, goal_change="truncate", random_age=True), device="cuda")
-    OnPolicyRunner(envs, train_cfg, log_dir="logs", device="cuda").learn(1000)
+    runner = OnPolicyRunner(envs, train_cfg, log_dir="logs", device="cuda")
+    runner.learn(1000)
+    policy(runner).save("rsl_rl.safetensors")   # what `play`, `export` and `Policy.load` take
 
 The observations are the group `policy`: `"obs_groups": {"actor": ["policy"], "critic": ["policy"]}`.
 """
@@ -19,7 +21,8 @@ from gymnasium.vector import AutoresetMode
 from rsl_rl.env import VecEnv
 from tensordict import TensorDict
 
-from .envs import VectorEnv
+from ._policy import Normalizer, Policy, array
+from .envs import Env, VectorEnv
 
 
 class _Settings(dict[str, Any]):
@@ -82,3 +85,25 @@ class RslRlVecEnv(VecEnv):
     def close(self) -> None:
         """Frees the environments."""
         self.envs.close()
+
+
+def policy(runner: Any, *, task: VectorEnv | Env | None = None) -> Policy:
+    """Returns the policy of a runner with an `MLPModel` and Gaussian actions, and with its normaliser. It needs rsl_rl 5.
+
+    Args:
+        runner: the runner.
+        task: the environments in which it was learnt, by default the runner's.
+
+    Raises ValueError for another model or distribution, and for observations of more than one group.
+    """
+    model = runner.alg.get_policy()
+    kinds = type(model).__name__, type(model.distribution).__name__
+    if kinds != ("MLPModel", "GaussianDistribution") or len(model.obs_groups) != 1:
+        raise ValueError(f"only an MLPModel with a GaussianDistribution and one group can be taken over, not {kinds}, {model.obs_groups}")
+    distribution, normalizer = model.distribution, None
+    if model.obs_normalization:
+        seen = model.obs_normalizer
+        normalizer = Normalizer(array(seen.mean), (array(seen.std).astype(np.float64) + seen.eps) ** 2, 0.0)
+    std = distribution.std_param if distribution.std_type == "scalar" else distribution.log_std_param.exp()
+    drawn = array(std).clip(*distribution.std_range)
+    return Policy.from_torch(model.mlp, task=task or runner.env.envs, normalizer=normalizer, std=drawn)

@@ -5,7 +5,8 @@
     from shadow_repose.sb3 import Sb3VecEnv
 
     envs = Sb3VecEnv(VectorEnv(256, training=True, goal_change="truncate", random_age=True))
-    PPO("MlpPolicy", envs, n_steps=16, batch_size=1024).learn(1_000_000)
+    model = PPO("MlpPolicy", envs, n_steps=16, batch_size=1024).learn(1_000_000)
+    policy(model).save("sb3.safetensors")                    # what `play`, `export` and `Policy.load` take
 """
 from __future__ import annotations
 
@@ -14,10 +15,12 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
+import torch
 from gymnasium.vector import AutoresetMode
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv
 
-from .envs import VectorEnv
+from ._policy import Normalizer, Policy, array
+from .envs import Env, VectorEnv
 
 
 class Sb3VecEnv(VecEnv):
@@ -85,3 +88,27 @@ class Sb3VecEnv(VecEnv):
     def get_images(self) -> Sequence[np.ndarray | None]:
         """Returns a picture of each environment, if they were made with `render_mode="rgb_array"`."""
         return self.envs.render() or [None] * self.num_envs
+
+
+def policy(model: Any, *, task: VectorEnv | Env | None = None) -> Policy:
+    """Returns the policy of a model with a `MlpPolicy` and Gaussian actions, such as PPO's or A2C's, and with its `VecNormalize`.
+
+    Args:
+        model: the model. Where it was loaded without environments, give it some by `set_env`, so that its `VecNormalize` is found.
+        task: the environments in which it was learnt, by default its own.
+
+    Raises ValueError for a policy that is no MLP, or whose actions are squashed or drawn from another distribution.
+    """
+    net, log_std = getattr(model.policy, "mlp_extractor", None), getattr(model.policy, "log_std", None)
+    if net is None or log_std is None or log_std.ndim != 1 or getattr(model.policy, "squash_output", False):
+        raise ValueError(f"only the MLP of a Gaussian policy (PPO, A2C) can be taken over, not {type(model).__name__} with this policy")
+    envs, statistics = model.get_env(), model.get_vec_normalize_env()
+    while task is None:
+        if not hasattr(envs, "venv") and not isinstance(envs, Sb3VecEnv):
+            raise ValueError("the model has no Sb3VecEnv: give the task in which it was learnt")
+        task, envs = (envs.envs, None) if isinstance(envs, Sb3VecEnv) else (None, envs.venv)
+    normalizer = None
+    if statistics is not None and statistics.norm_obs:
+        normalizer = Normalizer(statistics.obs_rms.mean, statistics.obs_rms.var, statistics.epsilon, statistics.clip_obs)
+    layers = torch.nn.Sequential(model.policy.features_extractor, net.policy_net, model.policy.action_net)
+    return Policy.from_torch(layers, task=task, normalizer=normalizer, std=np.exp(array(log_std)))

@@ -16,8 +16,8 @@ use shadow_repose::config::{Config, EnvConfig, PpoConfig};
 use shadow_repose::env::{Autoreset, End, EnvPool, EnvState};
 use shadow_repose::ranks::Exchange;
 use shadow_repose::repose::{
-    EpisodeStats, Lesson, Randomization, Repose, Task, TaskReward, TrainingReward, task_terms,
-    training_terms,
+    EpisodeStats, Lesson, Randomization, Record, Repose, Task, TaskReward, TrainingReward,
+    task_terms, training_terms,
 };
 use shadow_repose::sim::mujoco_version;
 
@@ -126,6 +126,35 @@ impl Hands {
         } else {
             Err(PyRuntimeError::new_err("these hands are closed"))
         }
+    }
+
+    /// The task in which it is scored: as it is now, without the help of a training.
+    pub(crate) fn task(&self) -> Arc<Task> {
+        self.made.task.clone()
+    }
+
+    /// What a policy that has learnt here learnt: the settings with the present smoothing of actions, the hand, the fingerprint of the
+    /// scene, and the control steps so far.
+    ///
+    /// # Errors
+    /// Fails if they are in use or closed, or if they are seen in a mirror.
+    pub(crate) fn learnt_task(&self) -> PyResult<(Config, Record, String, u64)> {
+        let env_steps = self.locked()?.as_ref().map_or(0, |state| state.env_steps);
+        let Made {
+            config,
+            task,
+            record,
+        } = &self.made;
+        if task.mirror().is_some() {
+            return Err(PyValueError::new_err(
+                "these hands are seen in the mirror of their policy: create them without it",
+            ));
+        }
+        let mut config = config.clone();
+        let reached = if self.training { env_steps } else { 0 };
+        config.env = config.env.at(reached);
+        let record = record.clone().unwrap_or_else(|| task.record());
+        Ok((config, record, task.scene.fingerprint(), env_steps))
     }
 
     fn observation_size(&self) -> usize {

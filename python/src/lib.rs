@@ -21,7 +21,7 @@ mod _native {
     #[pymodule_export]
     use super::hands::Hands;
     #[pymodule_export]
-    use super::policy::{Policy, evaluate};
+    use super::policy::{Policy, evaluate, file_of};
     #[pymodule_export]
     use super::prepare;
     use super::{PyModule, PyResult, flush_before_the_end};

@@ -6,18 +6,19 @@ use std::sync::{Arc, Mutex};
 
 use anyhow::Result;
 use numpy::{
-    IntoPyArray, PyArray1, PyArray2, PyArrayMethods, PyReadonlyArray2, PyReadonlyArrayDyn,
-    PyUntypedArrayMethods,
+    IntoPyArray, PyArray1, PyArray2, PyArrayMethods, PyReadonlyArray1, PyReadonlyArray2,
+    PyReadonlyArrayDyn, PyUntypedArrayMethods,
 };
 use pyo3::exceptions::{PyRuntimeError, PyValueError};
 use pyo3::prelude::*;
-use shadow_repose::config::{Override, Reader};
+use pyo3::types::PyBytes;
+use shadow_repose::config::{Override, Reader, Symmetry};
 use shadow_repose::evaluate::{Actor, Episodes, Trial};
 use shadow_repose::goal_times::GoalTimes;
 use shadow_repose::load::{self, Loaded, PolicySource};
-use shadow_repose::os::OutputFile;
+use shadow_repose::os::{OutputFile, compressed_for};
 use shadow_repose::play::json_score;
-use shadow_repose::ppo::{self, Checkpoint, GROUP};
+use shadow_repose::ppo::{self, Array, Checkpoint, GROUP};
 use shadow_repose::repose::Score;
 use shadow_repose::run;
 use shadow_repose::sim::SceneFiles;
@@ -25,6 +26,7 @@ use shadow_repose::spaces::Spaces;
 use shadow_repose::trace::Trace;
 
 use crate::errors::{guarded, refused};
+use crate::hands::Hands;
 use crate::settings::{Files, Made, Set, overrides, resolve, text};
 use crate::workers::Workers;
 
@@ -177,10 +179,16 @@ impl Policy {
         [spaces.observation_size, spaces.action_size]
     }
 
-    /// The standard deviation of each action.
+    /// `[A]`: the standard deviation of each action.
     #[getter]
-    fn std(&self) -> f32 {
-        self.loaded.policy.std()
+    fn std<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f32>> {
+        self.loaded.policy.stds().into_pyarray(py)
+    }
+
+    /// Its file.
+    fn content<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyBytes>> {
+        let bytes = self.loaded.checkpoint.policy_alone().to_bytes();
+        Ok(PyBytes::new(py, &bytes.map_err(refused)?))
     }
 
     /// The mean actions `[B, A]` for raw observations `[B, O]`.
@@ -199,10 +207,67 @@ impl Policy {
         py: Python<'py>,
         observations: PyReadonlyArray2<'py, f32>,
     ) -> PyResult<Bound<'py, PyArray1<f32>>> {
+        if !self.loaded.policy.has_critic {
+            return Err(PyValueError::new_err(
+                "this policy was learnt elsewhere and has no critic",
+            ));
+        }
         let rows = observations.shape()[0];
         self.computed(py, observations, 1, ppo::Policy::values)?
             .reshape([rows])
     }
+}
+
+/// A layer: its weights `[outputs, inputs]` and biases `[outputs]`.
+type Layer<'py> = (PyReadonlyArray2<'py, f32>, PyReadonlyArray1<'py, f32>);
+
+/// The numbers of a normaliser: means `[O]`, variances `[O]`, what is added to variances, and the limit of normalised values.
+type Normalisation = (Vec<f64>, Vec<f64>, f64, f64);
+
+/// The file of a policy for the task of `hands` that was learnt elsewhere: an actor of these layers without a critic. It knows of no
+/// symmetry. There is a standard deviation `[A]` for each action.
+#[pyfunction]
+pub(crate) fn file_of<'py>(
+    py: Python<'py>,
+    hands: &Hands,
+    layers: Vec<Layer>,
+    activation: &str,
+    normalisation: Normalisation,
+    std: Vec<f32>,
+) -> PyResult<Bound<'py, PyBytes>> {
+    let (mean, variance, epsilon, clip) = normalisation;
+    let (mut config, record, scene, env_steps) = hands.learnt_task()?;
+    config.ppo.symmetry = Symmetry::None;
+    config.ppo.activation = serde_json::from_value(activation.into())
+        .map_err(|_| PyValueError::new_err(format!("the activation {activation} is unknown")))?;
+    let inner = &layers[..layers.len().saturating_sub(1)];
+    config.ppo.hidden = inner.iter().map(|(_, biases)| biases.len()).collect();
+    let mut checkpoint = Checkpoint::default();
+    checkpoint.config = config.to_text();
+    checkpoint.hand = record.with(Symmetry::None).to_text();
+    checkpoint.scene = scene;
+    checkpoint.progress.env_steps = env_steps;
+    for (i, (weights, biases)) in layers.iter().enumerate() {
+        let numbers = weights.as_array().iter().copied().collect();
+        let weights = Array::F32(weights.shape().to_vec(), numbers);
+        checkpoint.insert(&format!("actor.{i}.weight"), weights);
+        let numbers = biases.as_array().to_vec();
+        let biases = Array::F32(vec![numbers.len()], numbers);
+        checkpoint.insert(&format!("actor.{i}.bias"), biases);
+    }
+    let log_std = std.iter().map(|std| std.ln()).collect();
+    checkpoint.insert("log_std", Array::F32(vec![std.len()], log_std));
+    for (name, numbers) in [
+        ("mean", mean),
+        ("variance", variance),
+        ("count", vec![0.0]),
+        ("epsilon", vec![epsilon]),
+        ("clip", vec![clip]),
+    ] {
+        let numbers = Array::F64(vec![numbers.len()], numbers);
+        checkpoint.insert(&format!("normalizer.{name}"), numbers);
+    }
+    Ok(PyBytes::new(py, &checkpoint.to_bytes().map_err(refused)?))
 }
 
 /// Lets the function write `actions`, a row for each row of observations. At an exception it sets `stop`.
@@ -240,11 +305,14 @@ fn ask(
 }
 
 /// The score that `play --json` prints, as JSON, and warnings about it. Who is scored is a policy, or a function that returns the actions
-/// `[N, A]`, float32, for the observations `[N, O]`. The first episodes are written to the file `trace`.
+/// `[N, A]`, float32, for the observations `[N, O]`. Without `hands`, the task is the policy's or has the default settings. The first
+/// episodes are written to the file `trace`.
 #[pyfunction]
+#[expect(clippy::too_many_arguments, reason = "Python names them")]
 pub(crate) fn evaluate(
     py: Python,
     scored: Py<PyAny>,
+    hands: Option<&Hands>,
     set: Set,
     episodes: usize,
     seed: u64,
@@ -257,13 +325,16 @@ pub(crate) fn evaluate(
             "episodes = {episodes}: must lie in [1, {most}]"
         )));
     }
+    let of_hands = hands.map(Hands::task);
     let policy = scored.cast_bound::<Policy>(py).ok().map(Bound::get);
     let raised = Mutex::new(None);
     let played = Workers::new(threads).long(py, |stop| {
         let set = overrides(set, false)?;
-        let task = match policy {
-            Some(policy) => policy.loaded.task(&policy.with(&set))?,
-            None => resolve(None, &set, &[])?.task,
+        let task = match (policy, &of_hands) {
+            (Some(policy), Some(task)) => task.clone().for_policy(&policy.loaded.record)?,
+            (None, Some(task)) => task.clone(),
+            (Some(policy), None) => policy.loaded.task(&policy.with(&set))?,
+            (None, None) => resolve(None, &set, &[])?.task,
         };
         let loaded = policy.map(|policy| &policy.loaded);
         let outside = |observations: &[f32], actions: &mut [f32]| {
@@ -336,7 +407,8 @@ fn played(
         return Ok(Default::default());
     };
     if let Some((file, trace)) = output {
-        file.finish(trace.finish().as_bytes())?;
+        let bytes = compressed_for(&file.path, trace.finish().into());
+        file.finish(&bytes)?;
     }
     let score = Score::of(&played, config.ctrl_dt);
     let warnings = trial.task.warnings.iter().cloned();

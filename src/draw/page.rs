@@ -4,13 +4,11 @@
 //! 16-bit integers, column by column, as differences from row to row. All low bytes come before all high bytes, so it compresses
 //! well.
 
-use std::io::Write;
-
 use base64::prelude::{BASE64_STANDARD, Engine};
-use flate2::Compression;
-use flate2::write::GzEncoder;
 use serde_json::{Value, json};
 use sha2::{Digest, Sha256};
+
+use crate::os::gzip;
 
 const PAGE: &str = include_str!("../../assets/page/page.html");
 const STYLE: &str = include_str!("../../assets/page/style.css");
@@ -111,9 +109,7 @@ fn packed(bytes: &[u8]) -> String {
     if bytes.is_empty() {
         return String::new();
     }
-    let mut encoder = GzEncoder::new(Vec::new(), Compression::best());
-    encoder.write_all(bytes).expect("memory takes all");
-    BASE64_STANDARD.encode(encoder.finish().expect("memory takes all"))
+    BASE64_STANDARD.encode(gzip(bytes))
 }
 
 /// Packs integers, which are taken modulo 2^16.

@@ -3,7 +3,7 @@
 use super::onnx::Attribute::{Float, Int};
 use super::onnx::Graph;
 use crate::config::Activation;
-use crate::ppo::{CLIP, Perception, Policy};
+use crate::ppo::{Perception, Policy};
 use crate::spaces::{ObjectAndGoal, Spaces};
 
 /// The graph from `obs` `[batch, O]` to `actions` `[batch, A]`, clipped to ± 1.
@@ -20,6 +20,7 @@ pub fn policy_graph(policy: &Policy, mirror: Option<&[f32]>) -> Graph {
         rotations,
         mean,
         factor,
+        clip: limit,
     } = policy.perception();
     let mut graph = Graph::new("policy", ("obs", size), ("actions", action_size));
     let seen = match mirror {
@@ -37,7 +38,7 @@ pub fn policy_graph(policy: &Policy, mirror: Option<&[f32]>) -> Graph {
     graph.floats("factor", &[size], &factor);
     graph.node("Sub", &[&seen, "mean"], "centred", &[]);
     graph.node("Mul", &["centred", "factor"], "scaled", &[]);
-    let normalised = clip(&mut graph, "scaled", CLIP, "normalised");
+    let normalised = clip(&mut graph, "scaled", limit, "normalised");
     let means = actor(&mut graph, policy, normalised);
     clip(&mut graph, &means, 1.0, "actions");
     graph

@@ -3,7 +3,7 @@
 #[cfg(target_vendor = "apple")]
 use std::ffi::OsString;
 use std::fs::{self, File, Metadata};
-use std::io::{self, Read};
+use std::io::{self, Read, Write};
 use std::os::fd::AsRawFd;
 #[cfg(target_vendor = "apple")]
 use std::os::unix::ffi::OsStringExt;
@@ -12,6 +12,9 @@ use std::path::{Path, PathBuf};
 use std::time::SystemTime;
 
 use anyhow::{Context, Result, ensure};
+use flate2::Compression;
+use flate2::read::MultiGzDecoder;
+use flate2::write::GzEncoder;
 
 /// The most bytes of a text file. A configuration takes a few KiB.
 const LARGEST_TEXT: u64 = 1 << 20;
@@ -100,6 +103,45 @@ pub fn read_text(path: &Path) -> Result<String> {
         path.display()
     );
     Ok(text)
+}
+
+/// These bytes, compressed by gzip if the name of their file ends in `.gz`.
+pub fn compressed_for(path: &Path, bytes: Vec<u8>) -> Vec<u8> {
+    if path.extension().is_some_and(|extension| extension == "gz") {
+        gzip(&bytes)
+    } else {
+        bytes
+    }
+}
+
+/// Bytes compressed by gzip.
+pub fn gzip(bytes: &[u8]) -> Vec<u8> {
+    let mut encoder = GzEncoder::new(Vec::new(), Compression::best());
+    encoder.write_all(bytes).expect("memory takes all");
+    encoder.finish().expect("memory takes all")
+}
+
+/// Reads the bytes of a regular file, which may be compressed by gzip.
+///
+/// # Errors
+/// Fails as [`read_bytes`] does, or if what is compressed is damaged or too large.
+pub fn read_unpacked(path: &Path) -> Result<Vec<u8>> {
+    let bytes = read_bytes(path)?;
+    if !bytes.starts_with(&[0x1f, 0x8b]) {
+        return Ok(bytes);
+    }
+    let mut unpacked = Vec::new();
+    let decoder = MultiGzDecoder::new(&bytes[..]);
+    decoder
+        .take(LARGEST_BYTES + 1)
+        .read_to_end(&mut unpacked)
+        .cannot("unpack", path)?;
+    ensure!(
+        unpacked.len() as u64 <= LARGEST_BYTES,
+        "{}: its content is larger than any file of this program",
+        path.display()
+    );
+    Ok(unpacked)
 }
 
 /// Reads the bytes of a regular file.

@@ -21,7 +21,10 @@ mod threads;
 
 pub use console::colors_enabled;
 pub use destination::Destination;
-pub use file::{Cannot, Stamp, expect_named, read_bytes, read_text, same_file, shown, stamp};
+pub use file::{
+    Cannot, Stamp, compressed_for, expect_named, gzip, read_bytes, read_text, read_unpacked,
+    same_file, shown, stamp,
+};
 pub use folder::Folder;
 pub use interrupt::{Requests, exit_code};
 pub use lock::{Hold, LOCK, Locked};

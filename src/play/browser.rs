@@ -146,7 +146,7 @@ pub fn from_trace(
     set: &[Override],
 ) -> Result<ExitCode> {
     let cannot = || format!("cannot use the trace {}", path.display());
-    let bytes = os::read_bytes(path)?;
+    let bytes = os::read_unpacked(path)?;
     ensure!(
         bytes.starts_with(b"{"),
         "{}: it does not begin with the header of a trace",

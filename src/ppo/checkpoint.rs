@@ -4,9 +4,12 @@
 //!
 //! Reading is strict: the arrays and their shapes must be exactly as the configuration describes.
 
+use std::mem;
+
 use anyhow::{Context, Result, anyhow, bail, ensure};
 
 use super::format::{self, Array, Arrays};
+use super::normalizer::{CLIP, EPSILON};
 use super::parameters::{ParameterLayout, View};
 use super::{Normalizer, Policy, Ppo, Progress};
 use crate::config::PpoConfig;
@@ -22,8 +25,17 @@ const CONVERTIBLE: &str = "shadow-repose checkpoint 4";
 /// The most bytes of a configuration that are read. Ours take one to two thousand.
 const LONGEST_CONFIG: usize = 1 << 16;
 
-/// The name of the logarithms of the standard deviations, one for each action: all are equal.
+/// The name of the logarithms of the standard deviations, one for each action.
 const LOG_STD: &str = "log_std";
+
+/// The beginning of the names of the critic's tensors. The policy of another program has none.
+const CRITIC: &str = "critic.";
+
+/// The name of what is added to variances, in a file where it is not [`EPSILON`].
+const EPSILON_NAME: &str = "normalizer.epsilon";
+
+/// The name of the limit of normalised values, in a file where it is not [`CLIP`].
+const CLIP_NAME: &str = "normalizer.clip";
 
 /// A checkpoint, or a policy alone, independent of a learner.
 #[derive(Clone, Default)]
@@ -115,7 +127,7 @@ impl Checkpoint {
     pub fn policy_alone(&self) -> Self {
         let mut alone = self.clone();
         alone.arrays.retain(|name, _| {
-            ["actor.", "critic.", "normalizer.", LOG_STD]
+            ["actor.", CRITIC, "normalizer.", LOG_STD]
                 .iter()
                 .any(|part| name.starts_with(part))
         });
@@ -194,8 +206,14 @@ impl Checkpoint {
         ParameterLayout::new(&config.hidden, spaces)
             .views()
             .iter()
+            .filter(|view| self.has_critic() || !view.name.starts_with(CRITIC))
             .try_for_each(|View { name, shape, .. }| self.expect(name, shape))?;
         self.expect(LOG_STD, &[spaces.action_size])
+    }
+
+    /// Whether it has a value function, or a part of one.
+    fn has_critic(&self) -> bool {
+        self.arrays.keys().any(|name| name.starts_with(CRITIC))
     }
 
     fn expect(&self, name: &str, shape: &[usize]) -> Result<()> {
@@ -213,19 +231,29 @@ impl Checkpoint {
     fn take_policy(&mut self, config: &PpoConfig, spaces: Spaces) -> Result<Policy> {
         self.expect_policy(config, &spaces)?;
         let mut policy = Policy::new(config, spaces);
-        policy.parameters = self.take_floats("", &policy.layout.views())?;
+        policy.has_critic = self.has_critic();
+        let mut views = policy.layout.views();
+        views.retain(|view| policy.has_critic || !view.name.starts_with(CRITIC));
+        let read = self.take_floats("", &views)?;
+        policy.parameters[..read.len()].copy_from_slice(&read);
         policy.log_std = match self.take(LOG_STD)? {
-            Array::F32(_, values) if values.iter().all(|&x| x == values[0]) => values[0],
-            _ => bail!("tensor `{LOG_STD}` must hold the same F32 value for each action"),
+            Array::F32(_, values) => values,
+            _ => bail!("tensor `{LOG_STD}` must be of type F32"),
         };
         let size = spaces.observation_size;
         let count = self.take_vector("normalizer.count", 1)?[0];
         let mean = self.take_vector("normalizer.mean", size)?;
         let variance = self.take_vector("normalizer.variance", size)?;
+        let mut own = |name: &str, usual| match self.shape(name) {
+            Some(_) => Ok(self.take_vector(name, 1)?[0]),
+            None => anyhow::Ok(usual),
+        };
+        let epsilon = own(EPSILON_NAME, EPSILON)?;
+        let clip = own(CLIP_NAME, CLIP)?;
         ensure!(
             mean.iter()
                 .chain(&variance)
-                .chain([&count])
+                .chain([&count, &epsilon])
                 .all(|x| x.abs() < 1e18),
             "a tensor `normalizer.…` has a value that no observations can produce"
         );
@@ -233,10 +261,16 @@ impl Checkpoint {
             count >= 0.0 && variance.iter().all(|&v| v >= 0.0),
             "tensor `normalizer.variance` or `normalizer.count` has a negative value"
         );
+        ensure!(
+            epsilon >= 0.0 && clip > 0.0 && variance.iter().all(|&v| v + epsilon > 0.0),
+            "tensor `{EPSILON_NAME}` or `{CLIP_NAME}` has a value that nothing can be divided or clipped by"
+        );
         policy.normalizer = Normalizer {
             mean,
             variance,
             count,
+            epsilon,
+            clip,
         };
         Ok(policy)
     }
@@ -287,7 +321,7 @@ impl Ppo {
                 checkpoint.insert(&format!("{prefix}{name}"), array);
             }
         }
-        let log_std = vec![self.policy.log_std; self.policy.spaces.action_size];
+        let log_std = self.policy.log_std.clone();
         checkpoint.insert(LOG_STD, Array::F32(vec![log_std.len()], log_std));
         checkpoint.insert("adam.steps", Array::U64(vec![1], vec![adam.steps]));
         checkpoint.insert("learning_rate", vector(&[self.learning_rate]));
@@ -295,14 +329,28 @@ impl Ppo {
         checkpoint.insert("normalizer.mean", vector(&normalizer.mean));
         checkpoint.insert("normalizer.variance", vector(&normalizer.variance));
         checkpoint.insert("normalizer.count", vector(&[normalizer.count]));
+        for (name, value, usual) in [
+            (EPSILON_NAME, normalizer.epsilon, EPSILON),
+            (CLIP_NAME, normalizer.clip, CLIP),
+        ] {
+            if value != usual {
+                checkpoint.insert(name, vector(&[value]));
+            }
+        }
     }
 
-    /// Starts with the policy of a checkpoint, or with a policy alone.
+    /// Starts with the policy of a checkpoint, or with a policy alone. If that has no critic, the own one stays.
     ///
     /// # Errors
     /// Fails if it is not the policy that the configuration describes.
     pub fn begin_with(&mut self, checkpoint: &Checkpoint) -> Result<()> {
-        self.policy = Policy::load(&self.config, self.policy.spaces, checkpoint)?;
+        let loaded = Policy::load(&self.config, self.policy.spaces, checkpoint)?;
+        let random = mem::replace(&mut self.policy, loaded);
+        if !self.policy.has_critic {
+            let [_, critic] = self.policy.layout.nets();
+            self.policy.parameters[critic.clone()].copy_from_slice(&random.parameters[critic]);
+            self.policy.has_critic = true;
+        }
         Ok(())
     }
 
@@ -499,12 +547,9 @@ mod tests {
             refused.contains("`adam.square.actor.1.bias` has a negative value"),
             "{refused}"
         );
-        negative.insert(LOG_STD, Array::F32(vec![2], vec![-1.0, -2.0]));
+        negative.insert(CLIP_NAME, Array::F64(vec![1], vec![0.0]));
         let refused = refusal(negative, &mut learner(&[8]));
-        assert!(
-            refused.contains("`log_std` must hold the same F32 value for each action"),
-            "{refused}"
-        );
+        assert!(refused.contains("nothing can be divided"), "{refused}");
     }
 
     #[test]

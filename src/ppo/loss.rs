@@ -41,7 +41,7 @@ pub struct Sums {
 impl<'a> Loss<'a> {
     /// Creates the losses of a minibatch of `samples` samples of `rollout` under `policy`.
     pub fn new(policy: &Policy, rollout: &'a Rollout, samples: usize, config: &PpoConfig) -> Self {
-        let log_std = policy.log_std;
+        let log_std = policy.log_std[0];
         let action_size = policy.spaces.action_size;
         Self {
             rollout,
@@ -209,7 +209,7 @@ mod tests {
         (config.value_coef, config.bounds_coef) = (2.0, 0.5);
         config.hidden = vec![1];
         let mut policy = Policy::new(&config, spaces);
-        policy.log_std = log_std;
+        policy.log_std.fill(log_std);
         let loss = Loss::new(&policy, &rollout, 3, &config);
         let (mut actor, mut critic) = (loss.of_none(), loss.of_none());
         let mut grad = [0.0; 6];

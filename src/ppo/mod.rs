@@ -34,7 +34,7 @@ pub use kernels::Workspace;
 pub use measure::{flops_per_sample, matmul_gflops, time_gradient_steps};
 pub use normalizer::Normalizer;
 pub use parameters::{Layer, ParameterLayout, View};
-pub use perception::{CLIP, Perception};
+pub use perception::Perception;
 pub use policy::{FrozenPolicy, GROUP, Policy};
 pub use progress::{Fork, Progress, Rise, beats};
 pub use rollout::{Rollout, RolloutBlock};
@@ -131,7 +131,9 @@ impl Ppo {
             rollout.resize(horizon, &self.policy.spaces);
         }
         self.env_steps = env_steps;
-        self.policy.log_std = self.config.std.at(env_steps).ln() as f32;
+        self.policy
+            .log_std
+            .fill(self.config.std.at(env_steps).ln() as f32);
     }
 
     /// Begins a fork of another run after this iteration.

@@ -17,7 +17,17 @@ pub struct Normalizer {
     pub variance: Vec<f64>,
     /// The number of observations seen.
     pub count: f64,
+    /// What is added to a variance, so that a constant value does not cause a division by zero.
+    pub epsilon: f64,
+    /// Normalised values are clipped to ± this many standard deviations, so that rare outliers do not upset the nets.
+    pub clip: f64,
 }
+
+/// What is added to variances.
+pub const EPSILON: f64 = 1e-5;
+
+/// The limit of normalised values.
+pub const CLIP: f64 = 5.0;
 
 impl Normalizer {
     /// Creates a normaliser that has seen nothing and leaves observations of `size` values almost unchanged.
@@ -26,6 +36,8 @@ impl Normalizer {
             mean: vec![0.0; size],
             variance: vec![1.0; size],
             count: 0.0,
+            epsilon: EPSILON,
+            clip: CLIP,
         }
     }
 

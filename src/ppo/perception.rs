@@ -10,12 +10,6 @@ use super::normalizer::Normalizer;
 use crate::quat::{self, CUBE_ROTATIONS};
 use crate::spaces::{ObjectAndGoal, Spaces};
 
-/// Normalised observations are clipped to ± this many standard deviations, so that rare outliers do not upset the nets.
-pub const CLIP: f32 = 5.0;
-
-/// Added to the variance, so that a constant input does not cause a division by zero.
-const EPSILON: f64 = 1e-5;
-
 /// The way a policy reads raw observations: turned, then normalised as `(x - mean) · factor`, clipped.
 pub struct Perception {
     /// The offsets of the orientations of cube and goal, if they are to be rotated.
@@ -26,11 +20,13 @@ pub struct Perception {
     pub mean: Vec<f32>,
     /// `[O]`
     pub factor: Vec<f32>,
+    /// The limit of normalised values.
+    pub clip: f32,
 }
 
 impl Perception {
     /// Creates the perception of the observations that `spaces` describes, by a policy that has seen these statistics.
-    pub fn new(spaces: &Spaces, Normalizer { mean, variance, .. }: &Normalizer) -> Self {
+    pub fn new(spaces: &Spaces, normalizer: &Normalizer) -> Self {
         let object_and_goal = spaces
             .object_and_goal
             .filter(|places| places.rotations != 1);
@@ -45,11 +41,13 @@ impl Perception {
                 own.next()
                     .map_or(CUBE_ROTATIONS[0], |(_, rotation)| rotation)
             }),
-            mean: mean.iter().map(|&m| m as f32).collect(),
-            factor: variance
+            mean: normalizer.mean.iter().map(|&m| m as f32).collect(),
+            factor: normalizer
+                .variance
                 .iter()
-                .map(|&v| (1.0 / (v + EPSILON).sqrt()) as f32)
+                .map(|&v| (1.0 / (v + normalizer.epsilon).sqrt()) as f32)
                 .collect(),
+            clip: normalizer.clip as f32,
         }
     }
 
@@ -79,7 +77,7 @@ impl Perception {
             for row in out.chunks_exact_mut(self.mean.len()) {
                 self.canonicalize(row);
                 for ((x, mean), factor) in row.iter_mut().zip(&self.mean).zip(&self.factor) {
-                    *x = ((*x - mean) * factor).clamp(-CLIP, CLIP);
+                    *x = ((*x - mean) * factor).clamp(-self.clip, self.clip);
                 }
             }
         });
@@ -199,7 +197,7 @@ mod tests {
         let normalizer = Normalizer {
             mean: vec![1.0; 20],
             variance: vec![4.0; 20],
-            count: 9.0,
+            ..Normalizer::new(20)
         };
         let perception = Perception::new(&SPACES, &normalizer);
         let raw = [
@@ -223,12 +221,12 @@ mod tests {
         let normalizer = Normalizer {
             mean: vec![2.0],
             variance: vec![4.0],
-            count: 9.0,
+            ..Normalizer::new(1)
         };
         let mut normalised = [0.0; 3];
         let perception = Perception::new(&UNTURNED, &normalizer);
         perception.apply(&[4.0, 2.0, 400.0], &mut normalised);
         assert!((normalised[0] - 1.0).abs() < 1e-5, "{normalised:?}");
-        assert_eq!(normalised[1..], [0.0, CLIP]);
+        assert_eq!(normalised[1..], [0.0, 5.0]);
     }
 }

@@ -1,4 +1,4 @@
-//! The policy: actor and critic MLPs, one standard deviation for all actions, and observation reading.
+//! The policy: actor and critic MLPs, the standard deviations of actions, and observation reading.
 
 use rand::RngExt;
 use rayon::prelude::*;
@@ -18,14 +18,16 @@ const LAST_ACTOR_LAYER: f32 = 0.1;
 /// The number of rows that are computed together where results must not depend on their number.
 pub const GROUP: usize = 64;
 
-/// A Gaussian policy whose actions are independent and have the same standard deviation, and its value function. It reads raw observations.
+/// A Gaussian policy whose actions are independent, and its value function. It reads raw observations.
 pub struct Policy {
     /// The location of each parameter.
     pub layout: ParameterLayout,
     /// All weights and biases.
     pub parameters: Vec<f32>,
-    /// The logarithm of the standard deviation of each action.
-    pub log_std: f32,
+    /// `[A]`: the logarithms of the standard deviations of the actions. While it learns here, all are equal.
+    pub log_std: Vec<f32>,
+    /// Whether it has a value function. A policy that was learnt elsewhere has none.
+    pub has_critic: bool,
     /// Statistics of the observations after perception.
     pub normalizer: Normalizer,
     /// The function after each hidden layer.
@@ -49,7 +51,8 @@ impl Policy {
         Self {
             parameters: vec![0.0; layout.count()],
             layout,
-            log_std: 0.0,
+            log_std: vec![0.0; spaces.action_size],
+            has_critic: true,
             normalizer: Normalizer::new(spaces.observation_size),
             activation: config.activation,
             spaces,
@@ -61,7 +64,7 @@ impl Policy {
     /// Weights and biases are uniform in ± 1/√inputs, as in PyTorch's `Linear`.
     pub fn random(config: &PpoConfig, spaces: Spaces, seed: u64) -> Self {
         let mut policy = Self {
-            log_std: config.std.at(0).ln() as f32,
+            log_std: vec![config.std.at(0).ln() as f32; spaces.action_size],
             ..Self::new(config, spaces)
         };
         let mut rng = rng::stream(seed, "weights", 0);
@@ -86,9 +89,15 @@ impl Policy {
         policy
     }
 
-    /// The standard deviation of each action at noise scale 1. Training may scale the noise (see `Acting`).
+    /// The standard deviation of all actions of a policy that learns here, at noise scale 1. Training may scale the noise (see
+    /// `Acting`).
     pub fn std(&self) -> f32 {
-        self.log_std.exp()
+        self.log_std[0].exp()
+    }
+
+    /// `[A]`: the standard deviation of each action.
+    pub fn stds(&self) -> Vec<f32> {
+        self.log_std.iter().map(|log| log.exp()).collect()
     }
 
     /// Adds the raw rows of these arrays `[B, O]` on all ranks to the normaliser.

@@ -251,7 +251,7 @@ impl Ppo {
             .expect("a step")
             .means(steps.len());
         // The entropy of the Gaussian at noise scale 1.
-        let of_action = f64::from(self.policy.log_std) + 0.5 * (TAU * E).ln();
+        let of_action = f64::from(self.policy.log_std[0]) + 0.5 * (TAU * E).ln();
         let entropy: f64 = repeat_n(of_action, self.policy.spaces.action_size).sum();
         UpdateStats {
             losses,

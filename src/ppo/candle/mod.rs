@@ -45,7 +45,7 @@ fn gathered(policy: &Policy, rollout: &Rollout, samples: &[u32]) -> Result<Batch
         observations: tensor(observation_size, observations)?,
         actions: tensor(action_size, array(action_size, |block| &block.actions))?,
         old_means: tensor(action_size, array(action_size, |block| &block.means))?,
-        log_std: Tensor::full(policy.log_std, action_size, &Device::Cpu)?,
+        log_std: Tensor::new(&policy.log_std[..], &Device::Cpu)?,
         scales: column(|block| &block.noise_scales)?,
         old_log_probs: column(|block| &block.log_probs)?,
         old_values: column(|block| &block.values)?,
