@@ -221,6 +221,9 @@ impl Policy {
 /// A layer: its weights `[outputs, inputs]` and biases `[outputs]`.
 type Layer<'py> = (PyReadonlyArray2<'py, f32>, PyReadonlyArray1<'py, f32>);
 
+/// The number of observations that the normaliser of a policy is said to have seen, so that it changes slowly where training continues.
+const SEEN: f64 = 1e8;
+
 /// The numbers of a normaliser: means `[O]`, variances `[O]`, what is added to variances, and the limit of normalised values.
 type Normalisation = (Vec<f64>, Vec<f64>, f64, f64);
 
@@ -260,7 +263,7 @@ pub(crate) fn file_of<'py>(
     for (name, numbers) in [
         ("mean", mean),
         ("variance", variance),
-        ("count", vec![0.0]),
+        ("count", vec![SEEN]),
         ("epsilon", vec![epsilon]),
         ("clip", vec![clip]),
     ] {

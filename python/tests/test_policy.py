@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import shadow_repose
-from shadow_repose import Policy, VectorEnv, evaluate, program
+from shadow_repose import Normalizer, Policy, VectorEnv, evaluate, program
 
 
 SIZE = VectorEnv(1).single_observation_space.shape[0]
@@ -177,3 +177,120 @@ def test_a_warning_about_a_policy_is_said_at_every_door(other_ranges, tmp_path):
         found = subprocess.run([program(), *command, "--ckpt", "builtin", *sets], cwd=tmp_path, capture_output=True, text=True, check=True)
         assert "warning: an action means another angle than in training" in found.stderr
     assert "; warning: an action means another angle than in training" in (tmp_path / "x.html").read_text()
+
+
+def net(*sizes, seed=0):
+    """Returns the layers of an MLP with random numbers."""
+    random = np.random.default_rng(seed)
+    pairs = zip(sizes, sizes[1:], strict=False)
+    return [(random.normal(0, 1 / inputs**0.5, (outputs, inputs)), random.normal(0, 0.1, outputs)) for inputs, outputs in pairs]
+
+
+def computed(layers, activation, rows):
+    """Returns what an MLP computes, in f64."""
+    for weights, biases in layers[:-1]:
+        rows = activation(rows @ weights.T + biases)
+    weights, biases = layers[-1]
+    return rows @ weights.T + biases
+
+
+FUNCTIONS = {"elu": lambda x: np.where(x > 0, x, np.expm1(np.minimum(x, 0))), "relu": lambda x: np.maximum(x, 0), "tanh": np.tanh}
+
+
+@pytest.mark.parametrize("activation", FUNCTIONS)
+def test_a_net_that_was_learnt_elsewhere_is_a_policy_with_its_own_normaliser_and_spread(tmp_path, activation):
+    envs, layers, random = VectorEnv(64, set={"env.act_moving_average": 0.5}), net(SIZE, 24, 16, 20), np.random.default_rng(1)
+    own = Normalizer(random.normal(size=SIZE), random.uniform(0, 2, SIZE), epsilon=1e-3, clip=1.5)
+    policy = Policy.from_layers(layers, activation, task=envs, normalizer=own, std=np.linspace(0.1, 2, 20))
+    seen = np.concatenate([envs.reset(seed=seed)[0] for seed in range(4)])
+    normal = np.clip((seen - own.mean) / np.sqrt(own.variance + own.epsilon), -own.clip, own.clip)
+    assert np.abs(policy(seen) - computed(layers, FUNCTIONS[activation], normal)).max() < 1e-5
+    file = tmp_path / "x.safetensors"
+    policy.save(file)
+    again = Policy.load(file)
+    assert np.array_equal(again(seen), policy(seen)) and np.allclose(again.std, np.linspace(0.1, 2, 20))
+    assert again.settings["env.act_moving_average"] == 0.5
+    with pytest.raises(ValueError, match="no critic"):
+        policy.values(seen)
+    drawn = policy(seen, deterministic=False, rng=np.random.default_rng(2)) - policy(seen)
+    assert np.allclose(drawn.std(0), policy.std, rtol=0.25)
+    played = subprocess.run([program(), "play", "--ckpt", file, "--headless", "--episodes", "3", "--json"], capture_output=True)
+    score = evaluate(again, episodes=3)
+    assert json.loads(played.stdout) == score
+    by_net = evaluate(lambda seen: policy(seen), envs=envs, episodes=3)
+    assert {**by_net, "checkpoint": score["checkpoint"]} == score
+    assert evaluate(lambda seen: policy(seen), episodes=3) != by_net
+
+
+def test_what_does_not_fit_the_task_is_no_policy():
+    envs = VectorEnv(1)
+    for wrong, layers, how in (
+        ("values in", net(SIZE - 1, 8, 20), {}),
+        ("20 out", net(SIZE, 8, 19), {}),
+        ("a hidden layer", net(SIZE, 20), {}),
+        ("sizes", net(SIZE, 8, 20)[:1] + net(9, 20), {}),
+        ("none of elu", net(SIZE, 8, 20), {"activation": "gelu"}),
+        ("std", net(SIZE, 8, 20), {"std": 0.0}),
+        ("not finite", [(weights * np.nan, biases) for weights, biases in net(SIZE, 8, 20)], {}),
+        ("divided or clipped", net(SIZE, 8, 20), {"normalizer": Normalizer(0.0, 0.0, 0.0)}),
+    ):
+        with pytest.raises(ValueError, match=wrong):
+            Policy.from_layers(layers, how.pop("activation", "elu"), task=envs, **how)
+    with pytest.raises(TypeError, match="VectorEnv"):
+        Policy.from_layers(net(SIZE, 8, 20), "elu", task="builtin")
+    with pytest.raises(ValueError, match="not both"):
+        evaluate("builtin", envs=envs, set={"env.friction_scale": 0.5})
+
+
+def test_a_module_of_torch_is_a_policy_if_it_is_an_mlp():
+    torch = pytest.importorskip("torch")
+    nn, envs, shared = torch.nn, VectorEnv(64), torch.nn.ELU()
+    module = nn.Sequential(nn.Linear(SIZE, 16), shared, nn.Sequential(nn.Linear(16, 8, bias=False), shared), nn.Linear(8, 20))
+    seen, _ = envs.reset(seed=0)
+    assert np.abs(Policy.from_torch(module, task=envs)(seen) - module(torch.as_tensor(seen)).detach().numpy()).max() < 1e-5
+
+    class Reversed(nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.layers = nn.Sequential(nn.Linear(SIZE, 8), nn.ReLU(), nn.Linear(8, 20))
+
+        def forward(self, rows):
+            return -self.layers(rows)
+
+    for wrong, other in (
+        ("something else", Reversed()),
+        ("alpha", nn.Sequential(nn.Linear(SIZE, 8), nn.ELU(0.5), nn.Linear(8, 20))),
+        ("Tanh", nn.Sequential(nn.Linear(SIZE, 8), nn.ELU(), nn.Linear(8, 20), nn.Tanh())),
+        ("LSTM", nn.LSTM(SIZE, 20)),
+    ):
+        with pytest.raises(ValueError, match=wrong):
+            Policy.from_torch(other, task=envs)
+
+
+def test_a_policy_that_was_learnt_elsewhere_is_exported_drawn_and_trained_on(tmp_path):
+    envs, file = VectorEnv(8, set={"env.max_episode_seconds": 0.2}), tmp_path / "x.safetensors"
+    Policy.from_layers(net(SIZE, 8, 20), "tanh", task=envs).save(file)
+    before = Policy.load(file)
+
+    def run(*words):
+        return subprocess.run([program(), *map(str, words)], check=True, capture_output=True, text=True, cwd=tmp_path)
+
+    run("export", "--ckpt", file, "--out", "x.onnx")
+    run("play", "--ckpt", file, "--episodes", 1, "--headless", "--out", "t.jsonl.gz")
+    run("play", "--from-trace", "t.jsonl.gz", "--plain", "--out", "y.html")
+    assert (tmp_path / "t.jsonl.gz").read_bytes()[:2] == b"\x1f\x8b" and (tmp_path / "y.html").stat().st_size > 50_000
+    small = ["--set", "env.num_envs=8", "--set", "ppo.hidden=[8]", "--set", "ppo.activation=tanh", "--set", "ppo.symmetry=none"]
+    run("train", "--init", file, *small, "--total-steps", 128, "--run-dir", "run", "--quiet")
+    after = Policy.load(tmp_path / "run")
+    seen, _ = VectorEnv(8).reset(seed=1)
+    assert after.values(seen).std() > 0 and 0 < np.abs(after(seen) - before(seen)).max() < 1
+
+
+def test_an_episode_is_shown_in_a_notebook(tmp_path):
+    pytest.importorskip("IPython")
+    trace, short = tmp_path / "t.jsonl.gz", {"env.max_episode_seconds": 0.2}
+    evaluate("builtin", episodes=1, set=short, trace=trace)
+    for what in ("builtin", Policy.load("builtin", set=short), trace):
+        assert "<iframe srcdoc=" in shadow_repose.show(what).data
+    with pytest.raises(ValueError, match="No such file"):
+        shadow_repose.show(tmp_path / "none.jsonl")

@@ -32,7 +32,11 @@ impl Destination {
                 path: path.into(),
             });
         }
-        let extension = Path::new(&name)
+        // A trace may be compressed.
+        let packed = name.to_str().and_then(|name| name.strip_suffix(".gz"));
+        let plain = packed.filter(|name| name.ends_with(".jsonl"));
+        let extension = plain
+            .map_or(Path::new(&name), Path::new)
             .extension()
             .and_then(|extension| extension.to_str());
         match extension.and_then(known) {
@@ -64,9 +68,10 @@ mod tests {
                 .unwrap()
         };
         assert_eq!(found("a/b.HTML"), ("html", "a/b.HTML".into()));
+        assert_eq!(found("x.jsonl.gz"), ("jsonl", "x.jsonl.gz".into()));
         assert_eq!(found("jsonl:/dev/stdout"), ("jsonl", "/dev/stdout".into()));
         assert_eq!(found("./jsonl:x.html"), ("html", "./jsonl:x.html".into()));
-        for name in ["x", "x.gif", "gif:x", "jsonl", ".html"] {
+        for name in ["x", "x.gif", "x.html.gz", "gif:x", "jsonl", ".html"] {
             let refused = "it must end in .html or .jsonl; html:FILE names the kind of a file without an ending";
             assert_eq!(parse(name).unwrap_err(), refused, "{name}");
         }
