@@ -16,10 +16,11 @@
 //! |---|---|---|
 //! | `main` | runs a command, prints errors, sets the exit code | bench, cli, export, manual, os, play, plot, ranks, runs, train, view |
 //! | `processor` | the sentence about a processor that MuJoCo cannot run on; of the program only | - |
-//! | [`mod@train`] | the training loop: collect, learn, evaluate, report, save | agent, cli, config, env, evaluate, load, os, ppo, quat, ranks, repose, rng, run, schedule, sim, tags |
+//! | [`mod@train`] | the training loop: collect, learn, evaluate, report, save | agent, check, cli, config, env, evaluate, load, os, ppo, quat, ranks, repose, rng, run, schedule, sim, tags |
 //! | [`mod@play`] | plays a policy: in a window or a browser, as a film or an HTML file, or for its score as a table or JSON | cli, config, evaluate, goal_times, load, os, ppo, repose, robustness, run, see, sim, trace |
+//! | [`mod@check`] | whether a hand can learn at all, before it is trained | config, env, quat, repose, rng |
 //! | [`mod@robustness`] | the score of a policy under changed physics, noise and delays | config, draw, evaluate, os, repose |
-//! | [`mod@view`] | shows the scene without a policy | cli, config, evaluate, os, repose, run, see, sim |
+//! | [`mod@view`] | shows the scene without a policy, and checks it | check, cli, config, evaluate, os, repose, run, see, sim |
 //! | [`mod@export`] | a policy as an ONNX file | cli, config, evaluate, load, os, ppo, repose, run, spaces |
 //! | [`mod@plot`] | learning curves of runs | cli, draw, os, run, tags |
 //! | [`mod@runs`] | a table of run folders; two of them compared | cli, config, os, run |
@@ -78,6 +79,7 @@
 
 pub mod agent;
 pub mod bench;
+pub mod check;
 pub mod cli;
 pub mod config;
 pub mod draw;

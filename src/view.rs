@@ -6,6 +6,7 @@ use std::sync::Arc;
 
 use anyhow::{Context, Result, bail};
 
+use crate::check::Check;
 use crate::cli::{Made, ViewArgs, expect_together, usage_error};
 use crate::config::{Config, Settings, expect_used};
 
@@ -19,7 +20,7 @@ use crate::sim::Look;
 const INSTEAD: &str =
     "Without a window, --web shows the hand in a browser, and --out hand.png draws it.";
 
-/// Shows the scene in a window or on a page, or writes one picture of it.
+/// Shows the scene in a window or on a page, writes one picture of it, or checks whether its hand can learn.
 ///
 /// # Errors
 /// Fails if a setting or the scene cannot be used, or if the picture cannot be written. Fails with what is missing if no window
@@ -27,6 +28,7 @@ const INSTEAD: &str =
 pub fn view(args: &ViewArgs) -> Result<()> {
     expect_used(&args.settings.set, "view")?;
     let made = match (&args.out, args.shot.web) {
+        _ if args.check => Made::Check,
         (Some(_), _) => Made::Picture,
         (None, Some(_)) => Made::Web,
         (None, None) => Made::Window,
@@ -37,6 +39,13 @@ pub fn view(args: &ViewArgs) -> Result<()> {
         .user_file(file)?
         .sets(&args.settings.set)
         .resolve()?;
+    if args.check {
+        let task = Task::new(&config)?;
+        os::say_line(task.table().trim_end());
+        task.notes().iter().for_each(|note| say!("note: {note}"));
+        os::say_line(Check::of(&task, &Config::default().env).table.trim_end());
+        return Ok(());
+    }
     let choice =
         Actor::without_policy(Path::new(&args.actions)).context("an actor for each motion")?;
     let look = args.shot.sized(args.size, args.quality);

@@ -300,6 +300,9 @@ pub struct ViewArgs {
     /// Write one picture (.png) and exit, without opening a window; needs no display
     #[arg(long, value_name = "FILE", value_parser = destination(&["png"]), help_heading = OUTPUT)]
     pub out: Option<Destination>,
+    /// Check whether the hand can learn, print a table with a verdict in each row, and exit
+    #[arg(long, help_heading = OUTPUT)]
+    pub check: bool,
     /// Fetch the meshes of the hand and exit, to show them later without a network
     #[arg(long, exclusive = true)]
     pub fetch: bool,

@@ -18,10 +18,12 @@ pub enum Made {
     Picture,
     /// An HTML file.
     Page,
+    /// The check of a hand.
+    Check,
 }
 
 /// What is made, its name, and the options that go with it. An option in no row goes with everything.
-const GO_WITH: [Row; 6] = [
+const GO_WITH: [Row; 7] = [
     (
         Made::Window,
         "a window",
@@ -103,6 +105,7 @@ const GO_WITH: [Row; 6] = [
         "an HTML file (--out)",
         &["--out FILE.html", "--from-trace", "--camera", "--plain"],
     ),
+    (Made::Check, "a check of the hand (--check)", &["--check"]),
 ];
 
 type Row = (Made, &'static str, &'static [&'static str]);

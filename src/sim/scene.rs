@@ -11,6 +11,7 @@ use super::compilation::{Compilation, Cone, origin};
 use super::constants::*;
 use super::finite::not_finite;
 use super::furnish::furnished;
+use super::placing::{frames_within, geoms_within, touches};
 use crate::os::shortened;
 
 /// What a scene may not disable: nothing could be held without it.
@@ -173,6 +174,16 @@ impl Scene {
     /// The size of the compiled scene in bytes.
     pub fn size(&self) -> usize {
         self.model.size()
+    }
+
+    /// The radius of a sphere about the origin of a body that holds its shapes, and those of the bodies that it carries, m.
+    pub fn radius(&self, Body(id): Body) -> f64 {
+        let model = &*self.model;
+        let shapes = geoms_within(model, &frames_within(model, id)).into_iter();
+        let radii = shapes
+            .filter(|&(geom, _)| touches(model, geom))
+            .map(|(geom, ([x, y, z], _))| model.geom_rbound()[geom] + x.hypot(y).hypot(z));
+        radii.fold(0.0, f64::max)
     }
 
     /// The number of controls.

@@ -167,6 +167,33 @@ impl Simulation {
         self.data.actuator_length()[actuator.id]
     }
 
+    /// The angle between what carries a body and a floor under it, rad: between the mean normal of the contacts at its tree of bodies,
+    /// in proportion to their forces, and the direction against gravity. Returns `None` if nothing presses against it, or without gravity.
+    pub fn tilt(&self, Body(id): Body) -> Option<f64> {
+        let model = self.data.model();
+        let own = |geom: i32| {
+            let body = model.geom_bodyid().get(geom as usize);
+            body.is_some_and(|&body| model.body_rootid()[body as usize] == model.body_rootid()[id])
+        };
+        let mut sum = [0.0; 3];
+        for (i, contact) in self.data.contact().iter().enumerate() {
+            let [of_first, of_second] = contact.geom.map(own);
+            if of_first == of_second {
+                continue;
+            }
+            let [force, ..] = self.data.contact_force(i);
+            // The normal points from the first geom to the second one.
+            let sign = if of_second { 1.0 } else { -1.0 };
+            for (sum, normal) in sum.iter_mut().zip(contact.frame) {
+                *sum += sign * force * normal;
+            }
+        }
+        let down = model.opt().gravity;
+        let product = |a: [f64; 3], b: [f64; 3]| a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+        let lengths = (product(sum, sum) * product(down, down)).sqrt();
+        (lengths > 0.0).then(|| (-product(sum, down) / lengths).clamp(-1.0, 1.0).acos())
+    }
+
     /// The pose of a frame.
     pub fn pose(&self, frame: Frame) -> Pose {
         match frame {

@@ -5,7 +5,6 @@ mod hints;
 mod lockstep;
 mod log;
 mod memory;
-mod mobility;
 mod outcome;
 mod saver;
 mod session;
@@ -15,6 +14,7 @@ use std::process::ExitCode;
 
 use anyhow::{Context, Result, anyhow, ensure};
 
+use crate::check::Check;
 use crate::cli::TrainArgs;
 use crate::config::Config;
 use crate::evaluate::{Actor, Episodes, Trial};
@@ -29,7 +29,6 @@ use hints::hints;
 use lockstep::Stop;
 use log::histograms;
 use memory::need;
-use mobility::mobility;
 use outcome::Outcome;
 use session::Session;
 
@@ -75,12 +74,19 @@ fn lead(args: &TrainArgs, requests: &Requests, exchange: &Exchange) -> Result<Ex
              (env.num_envs) need less"
         );
     }
-    if !args.quiet {
-        let default = Config::default();
-        let mut notes = session.task.notes();
-        if session.config.env.model_file().is_some() && args.resume.is_none() {
-            notes.push(mobility(&session.task, &default.env));
+    let default = Config::default();
+    if session.config.env.model_file().is_some() && args.resume.is_none() {
+        let check = Check::of(&session.task, &default.env);
+        if !args.quiet {
+            say!("{}", check.table.trim_end());
         }
+        check
+            .warnings
+            .iter()
+            .for_each(|text| say!("warning: {text}"));
+    }
+    if !args.quiet {
+        let mut notes = session.task.notes();
         notes.extend(hints(&session.config, args, &default));
         notes.push(format!(
             "memory: at most about {needed:.1} GiB; this machine has {has:.1} GiB"
