@@ -39,6 +39,8 @@ pub struct Task {
     pub(super) mirror: Option<Mirror>,
     /// What predicts the observations of the policy, if they are predicted.
     pub(super) predictor: Option<Arc<Predictor>>,
+    /// The number of actuators, joints and bodies that have no name in the scene.
+    unnamed: usize,
     /// Where the policy does not fit well.
     pub warnings: Vec<String>,
 }
@@ -59,8 +61,13 @@ impl Task {
     pub fn with_files(all: &Config, known: &Arc<SceneFiles>) -> Result<Arc<Self>> {
         let file = all.env.model_file();
         let mut config = all.env.clone();
-        let plain = Compilation::plain(config.sim_dt, config.cone).in_memory(file, known)?;
-        let as_it_is = Scene::load(file, &plain)?;
+        let mut plain = Compilation::plain(config.sim_dt, config.cone).in_memory(file, known)?;
+        let mut as_it_is = Scene::load(file, &plain)?;
+        let unnamed = as_it_is.unnamed();
+        if unnamed > 0 {
+            plain.names_parts = true;
+            as_it_is = Scene::load(file, &plain)?;
+        }
         let mut parts = Hand::find(&as_it_is, &all.hand).with_context(|| origin(file))?;
         let compilation = Compilation {
             object: parts.object.clone(),
@@ -98,6 +105,7 @@ impl Task {
             noise,
             bias,
             mirror: None,
+            unnamed,
             warnings: Vec::new(),
         }))
     }
@@ -180,6 +188,12 @@ impl Task {
                     os::shortened(&keys.join(", "))
                 ));
             }
+        }
+        if self.unnamed > 0 {
+            notes.push(format!(
+                "{} parts of {scene} have no name: they are called `servo of`, `joint of` or `link of` their neighbours",
+                self.unnamed
+            ));
         }
         let alike = self.scene.symmetry(self.hand.object.body).len();
         let object = &self.hand.parts.object;

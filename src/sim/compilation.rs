@@ -7,6 +7,7 @@
 
 use std::ffi::{CStr, CString};
 use std::fmt::Display;
+use std::iter;
 use std::path::Path;
 use std::ptr;
 use std::sync::Arc;
@@ -15,8 +16,8 @@ use std::thread;
 use anyhow::{Context, Error, Result, anyhow, bail, ensure};
 use mujoco_rs::mujoco_c::{mj_deleteSpec, mj_parseXML};
 use mujoco_rs::prelude::{MjModel, MjSpec};
-use mujoco_rs::wrappers::SpecItem;
 use mujoco_rs::wrappers::mj_editing::{MjsBody, MjsGeom};
+use mujoco_rs::wrappers::{SpecElement, SpecItem};
 use serde::{Deserialize, Serialize};
 
 use super::constants::*;
@@ -60,6 +61,8 @@ pub struct Compilation {
     pub shifts: bool,
     /// The name of a mocap body that is added to show the goal: it looks like the object, and touches nothing.
     pub adds_goal: Option<&'static str>,
+    /// Whether parts without a name get one.
+    pub names_parts: bool,
     /// Whether it leaves out what is only seen, such as meshes that touch nothing, and textures.
     pub physics_only: bool,
     /// The scene in memory. What is not there is read from its file.
@@ -79,6 +82,7 @@ impl Compilation {
             size: 1.0,
             shifts: false,
             adds_goal: None,
+            names_parts: false,
             physics_only: false,
             files: Arc::default(),
         }
@@ -181,6 +185,9 @@ impl Compilation {
             let whole = file.and_then(parse_error);
             refused(whole.unwrap_or_else(|| error.to_string()))
         })?;
+        if self.names_parts {
+            name_parts(&mut spec);
+        }
         if self.keeps_all() {
             return Ok(spec);
         }
@@ -203,6 +210,41 @@ impl Compilation {
             add_goal(&mut spec, &without_goal.compile(file)?, name, goal)?;
         }
         Ok(spec)
+    }
+}
+
+/// Names the actuators, bodies and joints that have no name: by what they drive, what moves them, or what they move.
+fn name_parts(spec: &mut MjSpec) {
+    for actuator in spec.actuator_iter_mut() {
+        give(actuator, "servo of", &actuator.target().to_owned());
+    }
+    name_within(spec.world_body_mut(), "the world");
+}
+
+fn name_within(body: &mut MjsBody, carrier: &str) {
+    let mut movers = body.joint_iter(false).map(SpecElement::name);
+    let mover = movers
+        .find(|name| !name.is_empty())
+        .unwrap_or(carrier)
+        .to_owned();
+    give(body, "link of", &mover);
+    let name = body.name().to_owned();
+    for joint in body.joint_iter_mut(false) {
+        if joint.type_() != mjJNT_FREE {
+            give(joint, "joint of", &name);
+        }
+    }
+    for child in body.body_iter_mut() {
+        name_within(child, &name);
+    }
+}
+
+/// Names an item that has no name, unless the name would be very long. If another one has the name already, it gets a number.
+fn give(item: &mut impl SpecItem, what: &str, of: &str) {
+    if item.name().is_empty() && of.len() < LONGEST_NAME / 2 {
+        let names = (2..99).map(|number| format!(" {number}"));
+        let mut names = iter::once(String::new()).chain(names);
+        names.find(|number| item.set_name(&format!("{what} {of}{number}")).is_ok());
     }
 }
 

@@ -253,6 +253,22 @@ impl Scene {
         names
     }
 
+    /// The number of actuators, joints but free ones, and bodies without a name.
+    pub fn unnamed(&self) -> usize {
+        let model = &self.model;
+        let parts = [
+            (mjOBJ_ACTUATOR, model.nactuator()),
+            (mjOBJ_JOINT, model.njnt()),
+            (mjOBJ_BODY, model.nbody()),
+        ];
+        let is_unnamed = |kind, id| {
+            let is_free = kind == mjOBJ_JOINT && model.jnt_type()[id] == mjJNT_FREE;
+            !is_free && model.id_to_name(kind, id).is_none_or(str::is_empty)
+        };
+        let count = |(kind, count)| ids(count).filter(|&id| is_unnamed(kind, id)).count();
+        parts.map(count).iter().sum()
+    }
+
     /// The names of all joints that have one.
     pub fn joints(&self) -> Vec<String> {
         self.names(mjOBJ_JOINT, ids(self.model.njnt()), &mut Problems::new())

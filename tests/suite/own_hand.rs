@@ -71,7 +71,8 @@ fn a_hand_of_another_kind_is_trained_resumed_played_and_exported() {
         &train(&[&["--total-steps", "256"], &own[..]].concat()),
     )));
     assert!(
-        said.contains("random actions turn `block` by") && said.contains("keyframe `cupped`"),
+        said.contains("random actions turn it, rad in 100 steps")
+            && said.contains("keyframe `cupped`"),
         "{said}"
     );
     let config = fs::read_to_string(folder.join("run/config.toml")).unwrap();
@@ -472,6 +473,34 @@ fn a_mocap_body_that_guides_something_is_not_the_goal() {
 }
 
 #[test]
+fn parts_without_a_name_are_called_by_what_they_drive_or_what_moves_them() {
+    let mut scene = THREE_FINGERS.to_owned();
+    for name in ["α distal", "α turns"] {
+        let attribute = format!("name=\"{name}\" ");
+        assert!(scene.contains(&attribute), "{name}");
+        scene = scene.replace(&attribute, "");
+    }
+    let (_folder, model) = placed(&scene);
+    let named = Task::new(&crate::support::config(&[&model])).unwrap();
+    let parts = &named.hand.parts;
+    assert!(
+        parts.actuators.contains(&"servo of α turn".to_owned()),
+        "{:?}",
+        parts.actuators
+    );
+    assert!(
+        parts.fingertips[0].starts_with("link of α"),
+        "{:?}",
+        parts.fingertips
+    );
+    assert!(named.notes().concat().contains("2 parts of"));
+    let (_other, model) = placed(THREE_FINGERS);
+    let own = Task::new(&crate::support::config(&[&model])).unwrap();
+    assert_eq!(own.scene.fingerprint(), named.scene.fingerprint());
+    assert!(!own.notes().concat().contains("no name"));
+}
+
+#[test]
 fn what_is_missing_or_ambiguous_in_a_scene_comes_in_one_message_with_the_setting_that_mends_it() {
     let block = THREE_FINGERS
         .split("<body name=\"block\"")
@@ -509,11 +538,6 @@ fn what_is_missing_or_ambiguous_in_a_scene_comes_in_one_message_with_the_setting
                 "name one by hand.object",
                 "several mocap bodies, `g1`, `g2`: name one by hand.goal",
             ],
-        ),
-        (
-            &THREE_FINGERS.replace("name=\"α distal\" ", ""),
-            &[],
-            &["body 4 of the compiled scene needs a name"],
         ),
         (
             &THREE_FINGERS.replace("<position name=\"α turns\" ", "<motor name=\"α turns\" "),
