@@ -115,7 +115,12 @@ impl Task {
     /// # Errors
     /// Fails if the scene or meshes cannot be read any more.
     pub fn for_display(&self, look: &Look) -> Result<Arc<Self>> {
-        let nominal = Scene::load_for_display(self.config.model_file(), &self.compilation, look)?;
+        let nominal = Scene::load_for_display(
+            self.config.model_file(),
+            &self.compilation,
+            look,
+            self.goal_place(),
+        )?;
         let hand = Hand::bind(&nominal, self.hand.parts.clone())?;
         let mut scene = nominal.varied(&Physics::of_task(&self.config).changes(&hand));
         scene.set_look(look, &nominal);

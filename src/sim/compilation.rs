@@ -318,14 +318,22 @@ fn add_goal(spec: &mut MjSpec, compiled: &MjModel, name: &str, goal: &str) -> Re
             let moved = quat::rotate(quat, compiled.mesh_pos()[mesh]);
             pos = [0, 1, 2].map(|axis| pos[axis] - moved[axis]);
         }
+        let material = usize::try_from(compiled.geom_matid()[geom]).ok();
+        let material = material.and_then(|id| compiled.id_to_name(mjOBJ_MATERIAL, id));
+        // It can be seen through. What has a material shows it, and the rest is green.
+        let colour = match material {
+            Some(_) => [1.0, 1.0, 1.0, 0.6],
+            None => [0.2, 0.8, 0.2, 0.4],
+        };
         only_seen(shown)
             .with_type(kind)
+            .with_material(material.unwrap_or_default())
             .with_size(compiled.geom_size()[geom])
             .with_pos(pos)
             .with_quat(quat)
             .with_meshname(mesh_name)
             .with_group(compiled.geom_group()[geom])
-            .with_rgba([0.2, 0.8, 0.2, 0.4]);
+            .with_rgba(colour);
     }
     Ok(())
 }

@@ -1,16 +1,17 @@
-//! What a custom scene may lack for display: a light, a sky, and cubes whose faces can be told apart.
+//! What a custom scene may lack for display: a light, a sky, a floor, a camera, and objects whose sides can be told apart.
 //!
 //! Nothing here changes the physics: what is added has no mass, collides with nothing, and comes after the existing objects.
 
 use std::path::Path;
 
 use anyhow::{Context, Result};
-use mujoco_rs::prelude::MjModel;
+use mujoco_rs::prelude::{MjData, MjModel, MjtGeomBase};
 use mujoco_rs::wrappers::SpecItem;
-use mujoco_rs::wrappers::mj_editing::MjsBody;
+use std::f64::consts::FRAC_1_SQRT_2;
 
 use super::compilation::{Compilation, VISUAL, only_seen};
 use super::constants::*;
+use super::placing::{Placed, frames_within, geoms_within, inside};
 use crate::quat;
 
 /// The colours of the faces, as in the built-in scene: +x, -x, +y, -y, +z, -z.
@@ -26,7 +27,26 @@ const FACES: [[f32; 3]; 6] = [
 /// The thickness of a face's plate beyond the box, as a fraction of the box's half size.
 const PLATE: f64 = 0.02;
 
-/// Compiles the scene in `file` with what it lacks. Returns `None` if it lacks nothing.
+/// How far a rod reaches beyond the object along its axis, and its radius, in terms of the object's least half size.
+const ROD: [f64; 2] = [0.6, 0.15];
+
+/// The radius of a dot on a round object, its half height, and the depth of its middle, in terms of the object's least half size.
+const DOT: [f64; 3] = [0.5, 0.17, 0.1];
+
+/// The orientations in which a capsule lies along x, y and z.
+const ALONG: [quat::Quat; 3] = [
+    [FRAC_1_SQRT_2, 0.0, FRAC_1_SQRT_2, 0.0],
+    [FRAC_1_SQRT_2, FRAC_1_SQRT_2, 0.0, 0.0],
+    quat::IDENTITY,
+];
+
+/// The half size of the goal for the camera, m.
+const GOAL: f64 = 0.04;
+
+/// The distance of a floor below the lowest shape, m.
+const BELOW: f64 = 0.02;
+
+/// Compiles the scene in `file` with what it lacks, and points its camera at what moves and at the place of the `goal`. Returns `None` if it lacks nothing.
 ///
 /// # Errors
 /// Fails if MuJoCo refuses the scene.
@@ -34,9 +54,12 @@ pub fn furnished(
     file: &Path,
     model: &MjModel,
     compilation: &Compilation,
+    goal: [f64; 3],
 ) -> Result<Option<MjModel>> {
     let is_dark = model.nlight() == 0;
     let has_no_sky = !model.tex_type().contains(&mjTEXTURE_SKYBOX);
+    let is_ground = |kind: &_| matches!(kind, mjGEOM_PLANE | mjGEOM_HFIELD);
+    let has_no_floor = !model.geom_type().iter().any(is_ground);
     let shown = |body: usize| {
         let name = model
             .id_to_name(mjOBJ_BODY, body)
@@ -44,13 +67,15 @@ pub fn furnished(
         let is_goal = model.body_mocapid()[body] >= 0;
         // A goal can be seen through.
         let opacity = if is_goal { 0.7 } else { 1.0 };
-        (is_goal || name == compilation.object).then_some((name, plain_box(model, body)?, opacity))
+        (is_goal || name == compilation.object).then_some((name, marks(model, body)?, opacity))
     };
-    let boxes: Vec<_> = (1..model.nbody() as usize).filter_map(shown).collect();
-    if !is_dark && !has_no_sky && boxes.is_empty() {
+    let marked: Vec<_> = (1..model.nbody() as usize).filter_map(shown).collect();
+    let mut spec = compilation.spec(Some(file))?;
+    let has_no_camera = spec.stat().extent.is_nan();
+    if !is_dark && !has_no_sky && !has_no_floor && !has_no_camera && marked.is_empty() {
         return Ok(None);
     }
-    let mut spec = compilation.spec(Some(file))?;
+    let [low, high] = space_of(model, goal);
     if is_dark {
         spec.world_body_mut()
             .add_light()
@@ -68,45 +93,161 @@ pub fn furnished(
             .with_rgb1([0.74, 0.78, 0.83])
             .with_rgb2([0.42, 0.49, 0.58]);
     }
-    for (name, half, opacity) in boxes {
+    if has_no_floor {
+        only_seen(spec.world_body_mut())
+            .with_type(mjGEOM_PLANE)
+            .with_size([0.0, 0.0, 0.05])
+            .with_pos([0.0, 0.0, low[2] - BELOW])
+            .with_quat(quat::IDENTITY)
+            .with_rgba([0.55, 0.58, 0.62, 1.0])
+            .with_group(0);
+    }
+    for (name, marks, opacity) in marked {
         let body = spec
             .body_mut(name)
             .context("a body of the compiled scene")?;
-        colour_faces(body, half, opacity);
+        for (mark, [red, green, blue]) in marks.into_iter().zip(FACES) {
+            only_seen(body)
+                .with_type(mark.kind)
+                .with_size(mark.size)
+                .with_pos(mark.position)
+                // Regardless of the defaults of its class.
+                .with_quat(mark.orientation)
+                .with_rgba([red, green, blue, opacity])
+                .with_group(VISUAL);
+        }
     }
-    compilation.finish(spec).map(Some)
+    let mut furnished = compilation.finish(spec)?;
+    if has_no_camera {
+        let statistics = furnished.stat_mut();
+        statistics.center = [0, 1, 2].map(|axis| 0.5 * (low[axis] + high[axis]));
+        let squares: f64 = (0..3).map(|axis| (high[axis] - low[axis]).powi(2)).sum();
+        statistics.extent = squares.sqrt();
+    }
+    Ok(Some(furnished))
 }
 
-/// Puts a coloured plate on each face of a box with these half sizes in m.
-fn colour_faces(body: &mut MjsBody, half: [f64; 3], opacity: f32) {
-    for (face, [red, green, blue]) in FACES.into_iter().enumerate() {
+/// A coloured shape that shows how an object is turned.
+struct Mark {
+    kind: MjtGeomBase,
+    size: [f64; 3],
+    position: [f64; 3],
+    orientation: quat::Quat,
+}
+
+/// A mark for each colour of [`FACES`]: plates on a box, dots on a round shape, and rods along the axes of anything else. An object with a
+/// material has none.
+fn marks(model: &MjModel, body: usize) -> Option<Vec<Mark>> {
+    let frames = frames_within(model, body);
+    let shapes = geoms_within(model, &frames);
+    if shapes.is_empty()
+        || shapes
+            .iter()
+            .any(|&(geom, _)| model.geom_matid()[geom] >= 0)
+    {
+        return None;
+    }
+    let [low, high] = box_around(model, &shapes);
+    let middle = [0, 1, 2].map(|axis| 0.5 * (low[axis] + high[axis]));
+    let half = [0, 1, 2].map(|axis| 0.5 * (high[axis] - low[axis]));
+    let least = half.into_iter().fold(f64::INFINITY, f64::min);
+    let [(geom, place), ..] = shapes[..] else {
+        return None;
+    };
+    let is_simple = shapes.len() == 1 && place == ([0.0; 3], quat::IDENTITY);
+    let mark = |face: usize| {
         let axis = face / 2;
-        let mut size = half.map(|half| 0.88 * half);
-        size[axis] = PLATE * half[axis];
-        let mut position = [0.0; 3];
-        position[axis] = if face % 2 == 0 {
-            half[axis]
-        } else {
-            -half[axis]
+        let sign = if face % 2 == 0 { 1.0 } else { -1.0 };
+        let at = |distance: f64| {
+            let mut position = middle;
+            position[axis] += sign * distance;
+            position
         };
-        only_seen(body)
-            .with_type(mjGEOM_BOX)
-            .with_size(size)
-            .with_pos(position)
-            // Regardless of the defaults of its class.
-            .with_quat(quat::IDENTITY)
-            .with_rgba([red, green, blue, opacity])
-            .with_group(VISUAL);
-    }
+        match model.geom_type()[geom] {
+            mjGEOM_BOX if is_simple => {
+                let mut size = half.map(|half| 0.88 * half);
+                size[axis] = PLATE * half[axis];
+                Mark {
+                    kind: mjGEOM_BOX,
+                    size,
+                    position: at(half[axis]),
+                    orientation: quat::IDENTITY,
+                }
+            }
+            mjGEOM_SPHERE | mjGEOM_ELLIPSOID | mjGEOM_CAPSULE | mjGEOM_CYLINDER if is_simple => {
+                let [radius, height, depth] = DOT.map(|part| part * least);
+                let mut size = [radius; 3];
+                size[axis] = height;
+                Mark {
+                    kind: mjGEOM_ELLIPSOID,
+                    size,
+                    position: at(half[axis] - depth),
+                    orientation: quat::IDENTITY,
+                }
+            }
+            _ => {
+                let length = half[axis] + ROD[0] * least;
+                Mark {
+                    kind: mjGEOM_CAPSULE,
+                    size: [ROD[1] * least, 0.5 * length, 0.0],
+                    position: at(0.5 * length),
+                    orientation: ALONG[axis],
+                }
+            }
+        }
+    };
+    Some((0..FACES.len()).map(mark).collect())
 }
 
-/// The half sizes (m) of a body that is one box in the middle of its frame, without a material.
-fn plain_box(model: &MjModel, body: usize) -> Option<[f64; 3]> {
-    let geom = usize::try_from(model.body_geomadr()[body]).ok()?;
-    let is_plain = model.body_geomnum()[body] == 1
-        && model.geom_type()[geom] == mjGEOM_BOX
-        && model.geom_matid()[geom] < 0
-        && model.geom_pos()[geom] == [0.0; 3]
-        && model.geom_quat()[geom] == quat::IDENTITY;
-    is_plain.then(|| model.geom_size()[geom])
+/// The corners of a box along the axes around shapes that have these places, m.
+fn box_around(model: &MjModel, shapes: &[(usize, Placed)]) -> [[f64; 3]; 2] {
+    let mut corners = [[f64::INFINITY; 3], [f64::NEG_INFINITY; 3]];
+    for &(geom, place) in shapes {
+        for point in points_of(model, geom) {
+            let (point, _) = inside(place, point, quat::IDENTITY);
+            for axis in 0..3 {
+                corners[0][axis] = corners[0][axis].min(point[axis]);
+                corners[1][axis] = corners[1][axis].max(point[axis]);
+            }
+        }
+    }
+    corners
+}
+
+/// Points of a shape in its frame whose hull contains it, m: the corners of a mesh, or of a box around another shape.
+fn points_of(model: &MjModel, geom: usize) -> Vec<[f64; 3]> {
+    if model.geom_type()[geom] == mjGEOM_MESH {
+        let mesh = model.geom_dataid()[geom] as usize;
+        let first = model.mesh_vertadr()[mesh] as usize;
+        let corners = &model.mesh_vert()[first..][..model.mesh_vertnum()[mesh] as usize];
+        return corners.iter().map(|corner| corner.map(f64::from)).collect();
+    }
+    let [x, y, z, half @ ..] = model.geom_aabb()[geom];
+    let sign = |corner: usize, axis: usize| if corner >> axis & 1 == 1 { 1.0 } else { -1.0 };
+    let corner = |i: usize| [0, 1, 2].map(|axis| [x, y, z][axis] + sign(i, axis) * half[axis]);
+    (0..8).map(corner).collect()
+}
+
+/// The corners of a box along the axes around all shapes that are not of the world itself in the default pose, and around the place of
+/// the goal, m.
+fn space_of(model: &MjModel, goal: [f64; 3]) -> [[f64; 3]; 2] {
+    let mut data = MjData::new(model);
+    data.kinematics();
+    let shapes: Vec<_> = ids(model.ngeom())
+        .filter(|&geom| model.geom_bodyid()[geom] > 0 && model.geom_group()[geom] <= VISUAL)
+        .map(|geom| {
+            let body = model.geom_bodyid()[geom] as usize;
+            let frame = (data.xpos()[body], data.xquat()[body]);
+            (
+                geom,
+                inside(frame, model.geom_pos()[geom], model.geom_quat()[geom]),
+            )
+        })
+        .collect();
+    let [mut low, mut high] = box_around(model, &shapes);
+    for axis in 0..3 {
+        low[axis] = low[axis].min(goal[axis] - GOAL);
+        high[axis] = high[axis].max(goal[axis] + GOAL);
+    }
+    [low, high]
 }

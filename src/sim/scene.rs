@@ -104,7 +104,7 @@ impl Scene {
             .with_context(|| origin(file))
     }
 
-    /// Loads the same scene, with the same physics, and with what is needed for display.
+    /// Loads the same scene, with the same physics, and with what is needed for display. The goal is shown at `goal`, m.
     ///
     /// # Errors
     /// Fails like [`Scene::load`], or if meshes cannot be read.
@@ -112,6 +112,7 @@ impl Scene {
         file: Option<&Path>,
         compilation: &Compilation,
         look: &Look,
+        goal: [f64; 3],
     ) -> Result<Self> {
         let compilation = &Compilation {
             physics_only: false,
@@ -125,7 +126,7 @@ impl Scene {
                 .map(|dress| dress.compile(compilation))
                 .transpose()?,
             // A scene to which nothing can be added is shown as it is.
-            Some(file) => furnished(file, &scene.model, compilation).unwrap_or_default(),
+            Some(file) => furnished(file, &scene.model, compilation, goal).unwrap_or_default(),
         };
         changed.map_or(Ok(scene), |model| Self::checked(model, compilation))
     }
