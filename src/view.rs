@@ -106,7 +106,7 @@ fn task_for_display(config: &Config, look: &Look) -> Result<Arc<Task>> {
 
 /// Shows the scene on a page, with a slider for each actuator, for as long as the program runs.
 fn show_on_page(args: &ViewArgs, port: u16, task: &Arc<Task>, choice: usize) -> Result<()> {
-    let sliders = see::Sliders::new(task);
+    let sliders = see::Sliders::of_actuators(task);
     let about = see::About {
         title: match task.config.model_file() {
             Some(file) => file.display().to_string(),

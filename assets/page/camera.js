@@ -72,14 +72,16 @@ class Orbit {
     const { fingers } = this;
     canvas.addEventListener("pointerdown", (event) => {
       canvas.setPointerCapture(event.pointerId);
+      if (!fingers.size && this.touch?.takes(event)) return;
       fingers.set(event.pointerId, { x: event.clientX, y: event.clientY, way: 0 });
     });
-    canvas.addEventListener("pointermove", (event) => this.drag(event, canvas.clientHeight));
+    canvas.addEventListener("pointermove", (event) => this.touch?.moves(event) || this.drag(event, canvas.clientHeight));
     canvas.addEventListener("pointerup", (event) => {
+      if (this.touch?.ends(event)) return;
       if (fingers.get(event.pointerId)?.way < 4 && fingers.size === 1) this.picked(event.offsetX, event.offsetY);
       fingers.delete(event.pointerId);
     });
-    canvas.addEventListener("pointercancel", (event) => fingers.delete(event.pointerId));
+    canvas.addEventListener("pointercancel", (event) => this.touch?.ends(event) || fingers.delete(event.pointerId));
     canvas.addEventListener("contextmenu", (event) => event.preventDefault());
     canvas.addEventListener("wheel", (event) => {
       event.preventDefault();

@@ -27,7 +27,7 @@ class Feed {
       act(event);
     });
     on("hello", ({ data }) => this.greet(JSON.parse(data)));
-    on("episode", ({ data }) => { const { hand, ...about } = JSON.parse(data); this.recording.announce(hand, about); });
+    on("episode", ({ data }) => { const { hand, ...about } = JSON.parse(data); this.recording.announce(hand, about); this.began?.(hand); });
     on("controls", ({ data }) => showControls(JSON.parse(data)));
     on("beat", () => {});
     on("message", ({ data, lastEventId }) => this.take(data, Number(lastEventId)));
@@ -78,52 +78,167 @@ class Feed {
   }
 }
 
+/** Sends something to the program. One request is under way at a time; what `next` returns after it goes next, if it returns anything. */
+class Sender {
+  constructor(next) { Object.assign(this, { next, busy: false }); }
+
+  async send() {
+    const said = this.busy ? undefined : this.next();
+    if (said === undefined) return;
+    this.busy = true;
+    const body = JSON.stringify(said);
+    try {
+      const answer = await fetch(`controls${location.search}`, { method: "POST", headers: { "Content-Type": "application/json" }, body });
+      if (!answer.ok) notice(`The program refused this: ${answer.status} ${answer.statusText}.`);
+    } catch {
+      notice("This did not reach the program.");
+    }
+    this.busy = false;
+    this.send();
+  }
+}
+
+const BUTTONS = { pause: "Pause or go on", step: "One step", goal: "Next goal", episode: "New episode", reset: "As the task has it" };
+const AGAIN = 100; // milliseconds after which a push is asked for again
+const STRETCH = .05; // metres of a pull that is as strong as twice the object's weight
+const STRONGEST = 4; // times the object's weight
+
+/** Pushes the object where it is dragged, with a force that is drawn as a line. */
+class Touch {
+  constructor(player, { at, mass }) {
+    const body = player.scene.bodies.findIndex(({ joints }) => joints.some((joint) => joint.type === "free" && joint.at === at));
+    Object.assign(this, { player, body, weight: 9.81 * mass, pointer: null });
+    this.sender = new Sender(() => { const { said } = this; this.said = undefined; return said; });
+    setInterval(() => this.pull(), AGAIN);
+  }
+
+  /** Where the object of a hand is on the screen, and what moves a point there by pixels. */
+  seen(hand) {
+    const { player, body } = this, { scene, recording, orbit, poses } = player, { clientWidth, clientHeight } = player.screen.canvas;
+    const tile = tilesOf(recording.hands, clientWidth, clientHeight)[hand], { eye, forward, tangent } = orbit.sight;
+    const at = [...poses.subarray(8 * (hand * scene.bodies.length + body)).subarray(0, 3)];
+    const [x, y, away] = projectionOf(orbit.sight, tile)(at), view = lookAlong(eye, forward, [0, 0, 1]);
+    const [, , width, height] = tile, pixel = away * tangent * Math.max(1, .9 * height / width) / (height / 2);
+    const axis = (k) => [view[k], view[k + 4], view[k + 8]].map((part) => part * pixel);
+    return { at, x, y, away, right: axis(0), up: axis(1) };
+  }
+
+  /** Whether a pointer that comes down there takes hold of an object. */
+  takes({ offsetX, offsetY, pointerId, button }) {
+    if (button || this.body < 0 || !this.player.following || this.pointer) return false;
+    const near = 22;
+    for (let hand = 0; hand < this.player.recording.hands; hand++) {
+      const { x, y, away, right } = this.seen(hand);
+      if (away > 0 && Math.hypot(offsetX - x, offsetY - y) < Math.max(near, .03 / Math.hypot(...right))) {
+        this.pointer = { id: pointerId, hand, x: offsetX, y: offsetY };
+        return true;
+      }
+    }
+    return false;
+  }
+
+  moves({ offsetX, offsetY, pointerId }) {
+    if (this.pointer?.id !== pointerId) return false;
+    Object.assign(this.pointer, { x: offsetX, y: offsetY });
+    this.pull();
+    return true;
+  }
+
+  ends({ pointerId }) {
+    if (this.pointer?.id !== pointerId) return false;
+    this.push([0, 0, 0]);
+    this.drop();
+    return true;
+  }
+
+  /** Lets the object go. */
+  drop() {
+    this.pointer = null;
+    this.draw();
+  }
+
+  pull() {
+    if (!this.pointer) return;
+    const { x, y, right, up } = this.seen(this.pointer.hand), [across, down] = [this.pointer.x - x, this.pointer.y - y];
+    const way = [0, 1, 2].map((k) => right[k] * across - up[k] * down), length = Math.hypot(...way) || 1;
+    const force = this.weight * Math.min(STRONGEST, 2 * length / STRETCH);
+    this.push(way.map((part) => part / length * force));
+    this.draw();
+  }
+
+  push(force) {
+    this.said = { push: [this.pointer.hand, force] };
+    this.sender.send();
+    this.newtons = Math.hypot(...force);
+  }
+
+  draw() {
+    const line = byId("force"), { pointer } = this;
+    line.hidden = !pointer;
+    if (!pointer) return;
+    const { x, y } = this.seen(pointer.hand), [across, down] = [pointer.x - x, pointer.y - y];
+    line.textContent = `${this.newtons.toFixed(2)} N`;
+    Object.assign(line.style, {
+      left: `${x}px`, top: `${y}px`, width: `${Math.hypot(across, down)}px`, transform: `rotate(${Math.atan2(down, across)}rad)`,
+    });
+  }
+}
+
 function showControls(values) {
   [...byId("sliders").querySelectorAll("input")].forEach((input, i) => {
     if (input === document.activeElement && performance.now() - (input.touched ?? -1e9) < 1000) return;
     input.value = values[i];
-    input.nextElementSibling.textContent = Number(values[i]).toFixed(2);
+    show(input, values[i]);
   });
 }
 
-/** A slider for each actuator; what is moved goes to the program, at most one request at a time. */
-function makeSliders(sliders) {
-  const box = byId("sliders"), moved = new Map();
-  let busy = false;
-  const send = async () => {
-    if (busy || !moved.size) return;
-    busy = true;
-    const body = JSON.stringify([...moved]);
+/** Shows the value of a slider, in bold if it is not what the task has. */
+function show(input, value) {
+  input.nextElementSibling.textContent = Number(value).toFixed(2);
+  input.parentElement.classList.toggle("changed", Math.abs(value - input.start) > 1e-9);
+}
+
+/** The sliders, and buttons if the page may also touch the world. What is moved or pressed goes to the program. */
+function makeSliders(sliders, touches) {
+  const box = byId("sliders"), moved = new Map(), pressed = [];
+  const sender = new Sender(() => {
+    if (pressed.length) return pressed.shift();
+    const said = moved.size ? [...moved] : undefined;
     moved.clear();
-    try {
-      const answer = await fetch(`controls${location.search}`, { method: "POST", headers: { "Content-Type": "application/json" }, body });
-      if (!answer.ok) notice(`The program refused the new value: ${answer.status} ${answer.statusText}.`);
-    } catch {
-      notice("The new value did not reach the program.");
-    }
-    busy = false;
-    send();
-  };
-  sliders.forEach(({ name, low, high, value }, i) => {
-    const label = make("label", "", name), input = make("input", ""), shown = make("output", "", value.toFixed(2));
-    Object.assign(input, { type: "range", min: low, max: high, step: "any", value });
+    return said;
+  });
+  if (touches) {
+    const row = make("p", "");
+    Object.entries(BUTTONS).forEach(([order, text]) => {
+      const button = make("button", "", text);
+      button.onclick = () => { pressed.push(order); sender.send(); };
+      row.append(button);
+    });
+    box.append(row, make("p", "", "Drag the object to push it. Values that differ from the task are bold."));
+  }
+  sliders.forEach(({ name, low, high, step, value }, i) => {
+    const label = make("label", "", name), input = make("input", ""), shown = make("output", "");
+    Object.assign(input, { type: "range", min: low, max: high, step: step || "any", value, start: value });
     input.oninput = () => {
       input.touched = performance.now();
-      shown.textContent = Number(input.value).toFixed(2);
+      show(input, Number(input.value));
       moved.set(i, Number(input.value));
-      send();
+      sender.send();
     };
     label.append(input, shown);
     box.append(label);
+    show(input, value);
   });
-  box.hidden = !sliders.length;
-  if (sliders.length) byId("rewards").hidden = true;
+  const open = (shown) => { [box.hidden, byId("rewards").hidden] = [!shown, shown]; };
+  byId("touch").hidden = !touches;
+  byId("touch").onclick = () => open(box.hidden);
+  open(sliders.length > 0 && !touches);
 }
 
 /** Makes a file of the page as it came (`original`, a copy of the document) and the kept rows. */
 async function saveFile(original, recording) {
   const page = original.cloneNode(true), { text, entries } = await recording.write(), { meta } = recording;
-  const { live, key, sliders, ...lasting } = meta;
+  const { live, key, sliders, object, ...lasting } = meta;
   const part = (id) => page.querySelector(`#${id}`);
   part("meta").textContent = JSON.stringify({ ...lasting, ...entries, live: false }).replaceAll("<", "\\u003c");
   part("rows").textContent = text;

@@ -118,7 +118,9 @@ class Player {
   }
 
   follow() {
-    makeSliders(this.recording.meta.sliders ?? []);
+    const { sliders = [], object } = this.recording.meta;
+    makeSliders(sliders, Boolean(object));
+    if (object) this.orbit.touch = this.touch = new Touch(this, object);
     byId("save").hidden = false;
     byId("save").onclick = () => {
       if (!this.recording.rows.length) return notice("There is nothing to save yet.");
@@ -128,6 +130,7 @@ class Player {
       this.now = Math.max(0, this.now - dropped);
       this.line.stale = this.dirty = true;
     });
+    this.feed.began = (hand) => { if (this.touch?.pointer?.hand === hand) this.touch.drop(); };
   }
 
   listen() {
@@ -254,6 +257,7 @@ class Player {
     }
     this.screen.picture.draw(this.poses, this.orbit.sight, this.tone);
     this.drawGoal();
+    this.touch?.draw();
     if (this.live && this.line.stale) this.rewards.measure();
     this.line.draw(now);
     this.facts.draw(row, hand);

@@ -16,7 +16,7 @@ use crate::os;
 pub const MODEL: &str = "env.model";
 
 /// One `--set key=value`.
-#[derive(Clone)]
+#[derive(Clone, PartialEq)]
 pub struct Override {
     /// The dotted key, e.g. `ppo.learning_rate`.
     pub key: String,

@@ -37,7 +37,7 @@ pub struct Server {
     host: String,
     /// What each request must have in its address: a query with a secret, or nothing.
     pub token: String,
-    page: String,
+    page: Mutex<String>,
     on_post: Option<OnPost>,
     news: Mutex<News>,
     /// The permits of readers and of connections: each has a copy as long as it lives.
@@ -94,7 +94,7 @@ impl Server {
             token: host.map_or_else(String::new, |_| {
                 format!("?access={:032x}", rand::random::<u128>())
             }),
-            page,
+            page: page.into(),
             on_post,
             news,
             readers,
@@ -106,6 +106,11 @@ impl Server {
             .spawn(move || own.accept(&listener))
             .context("cannot start a thread for the server")?;
         Ok(server)
+    }
+
+    /// Serves another page from now on.
+    pub fn replace_page(&self, page: String) {
+        *self.page.lock().unwrap_or_else(PoisonError::into_inner) = page;
     }
 
     /// Sets the event that readers get first.
@@ -187,7 +192,14 @@ impl Server {
         let not_here = "This method is not allowed here.";
         // An error of a write is a reader that has gone, or has read nothing for too long.
         let _ = match (&*request.method, &*request.name, &self.on_post) {
-            ("GET", "", _) => answer(stream, "200 OK", "text/html", &self.page),
+            ("GET", "", _) => {
+                let page = self
+                    .page
+                    .lock()
+                    .unwrap_or_else(PoisonError::into_inner)
+                    .clone();
+                answer(stream, "200 OK", "text/html", &page)
+            }
             ("GET", "events", _) => {
                 request.expect_own(!self.token.is_empty())?;
                 let permit = self.take_permit(&self.readers, MOST_READERS);

@@ -9,12 +9,12 @@ use serde_json::{Value, json};
 use toml::Table;
 
 use super::stage::{Stage, with_warnings};
-use crate::config::{MODEL, Override, Reader, Settings, Source, short};
+use crate::config::{EnvConfig, MODEL, Override, Reader, Settings, Source, short};
 use crate::load::PolicySource;
 use crate::os::{self, Destination, Place, Stamp, say};
 use crate::repose::Task;
 use crate::run::{self, RunFolder};
-use crate::see::{self, About, Live, Replay};
+use crate::see::{self, About, Live, Replay, Slider, Sliders};
 use crate::sim::Look;
 
 /// The most bytes of a line of a trace. A step of the Shadow Hand has 5000.
@@ -80,7 +80,86 @@ impl Followed {
     }
 }
 
-/// Shows the hand on a page for as long as the program runs. If a run is `followed`, each episode uses its newest policy.
+/// The sliders of a page for quantities of the physics: quantity, name, ends.
+const FACTORS: [(&str, &str, [f64; 2]); 4] = [
+    ("friction", "friction, ×", [0.3, 2.0]),
+    ("cube_mass", "mass of the object, ×", [0.3, 3.0]),
+    ("damping", "damping of the joints, ×", [0.2, 5.0]),
+    ("gains", "stiffness of the servos, ×", [0.5, 2.0]),
+];
+
+/// The sliders for settings of the next episode: setting, name, ends, distance between values.
+const SETTINGS: [(&str, &str, [f64; 2], f64); 3] = [
+    (
+        "env.cube_size_scale",
+        "size of the object, ×, from the next episode on",
+        [0.8, 1.2],
+        0.05,
+    ),
+    (
+        "env.action_delay",
+        "delay, control steps, from the next episode on",
+        [0.0, 8.0],
+        1.0,
+    ),
+    (
+        "env.prediction",
+        "prediction, control steps, from the next episode on",
+        [0.0, 8.0],
+        1.0,
+    ),
+];
+
+/// The sliders for the world of a task, and for the noise of a policy's actions.
+fn sliders(stage: &Stage) -> Sliders {
+    let env = &stage.task.config;
+    let mut sliders: Vec<Slider> = FACTORS
+        .into_iter()
+        .map(|(quantity, name, range)| Slider::new(name, range, 0.0, 1.0).of_quantity(quantity))
+        .collect();
+    let starts = [
+        env.cube_size_scale,
+        env.action_delay.into(),
+        env.prediction.into(),
+    ];
+    for ((_, name, [low, high], step), start) in SETTINGS.into_iter().zip(starts) {
+        let range = [low.min(start), high.max(start)];
+        sliders.push(Slider::new(name, range, step, start));
+    }
+    if stage.policy.is_some() {
+        let drawn = stage.choice as f64;
+        sliders.push(Slider::new(
+            "0: mean actions, 1: actions with noise",
+            [0.0, 1.0],
+            1.0,
+            drawn,
+        ));
+    }
+    Sliders::new(sliders, true)
+}
+
+/// The settings that the sliders have changed.
+fn changed(sliders: &Sliders, task: &EnvConfig) -> Vec<Override> {
+    let values = sliders.values();
+    let values = SETTINGS.iter().zip(&values[FACTORS.len()..]);
+    let usual = [
+        task.cube_size_scale,
+        task.action_delay.into(),
+        task.prediction.into(),
+    ];
+    let values = values
+        .zip(usual)
+        .filter(|((_, value), usual)| **value != *usual);
+    values
+        .map(|(((key, ..), value), _)| Override {
+            key: (*key).into(),
+            value: value.to_string(),
+        })
+        .collect()
+}
+
+/// Shows the hand on a page for as long as the program runs. If a run is `followed`, each episode uses its newest policy. The page can
+/// push the object, and change the world.
 ///
 /// # Errors
 /// Fails if the port cannot be opened.
@@ -91,19 +170,29 @@ pub fn live(
     mut followed: Option<Followed>,
     (seed, set): (u64, &[Override]),
 ) -> Result<ExitCode> {
+    let sliders = sliders(&stage);
+    let own = sliders.clone();
+    let draws: Rc<dyn Fn() -> bool> =
+        Rc::new(move || own.values().get(FACTORS.len() + SETTINGS.len()) == Some(&1.0));
     let task = see::task_for_display(&stage.task, shot)?;
-    let stage = Rc::new(stage);
     let mut about = about(&stage, seed);
     if let Some(followed) = &followed {
         about.title = followed.run.place().display().to_string();
         about.policy = None;
     }
-    let mut acting = stage.clone().acting(task.clone());
-    let live = Live::open(place, (&about, shot.camera), hands as usize, &acting, None)?;
-    let load = |path: &Path| {
+    let path = match (&followed, &stage.policy) {
+        (Some(followed), _) => followed.path.clone(),
+        (None, Some(policy)) => policy.origin.path().to_owned(),
+        (None, None) => stage.actor().name().into(),
+    };
+    let stage = Rc::new(stage);
+    let mut acting = stage.clone().acting(task.clone(), draws.clone());
+    let look = (&about, shot.camera);
+    let live = Live::open(place, look, hands as usize, &acting, Some(sliders.clone()))?;
+    let load = |sets: &[Override]| {
         let newer = Stage {
             choice: stage.choice,
-            ..Stage::find(Some(path), set)?
+            ..Stage::find(Some(&path), &[set, sets].concat())?
         };
         let record = |stage: &Stage| stage.policy.as_ref().map(|policy| policy.record.clone());
         ensure!(
@@ -111,8 +200,8 @@ pub fn live(
             "{} is for another hand",
             path.display()
         );
-        let own = task.at_the_stage_of(&newer.task.config);
-        let mut acting = Rc::new(newer).acting(own);
+        let shown = see::task_for_display(&newer.task, shot)?;
+        let mut acting = Rc::new(newer).acting(shown, draws.clone());
         // The page shows the settings of the first policy.
         for (key, value) in acting.task.config.unlike(&task.config) {
             if let Some(name) = &mut acting.policy {
@@ -121,14 +210,15 @@ pub fn live(
         }
         Ok(acting)
     };
+    let mut known = Vec::new();
     live.show(&mut || {
-        if let Some(followed) = &mut followed
-            && followed.has_changed()
-        {
-            match load(&followed.path) {
+        let sets = changed(&sliders, &task.config);
+        if followed.as_mut().is_some_and(Followed::has_changed) || sets != known {
+            match load(&sets) {
                 Ok(newer) => acting = newer,
-                Err(error) => say!("warning: {error:#}\n  The previous policy continues."),
+                Err(error) => say!("warning: {error:#}\n  The previous one continues."),
             }
+            known = sets;
         }
         acting.clone()
     })

@@ -113,12 +113,13 @@ impl Stage {
         Some(with_warnings(&self.policy.as_ref()?.name, warnings))
     }
 
-    /// The actor of a page that shows this task.
-    pub fn acting(self: Rc<Self>, task: Arc<Task>) -> LiveActor {
+    /// The actor of a page that shows this task. Its actions are drawn if `draws` says so, or as the user has chosen.
+    pub fn acting(self: Rc<Self>, task: Arc<Task>, draws: Rc<dyn Fn() -> bool>) -> LiveActor {
         LiveActor {
             policy: self.described(),
             step: Rc::new(move |player: &mut Player| {
-                let (_, actor) = &self.actors_of(Policy::freeze_briefly)[self.choice];
+                let choice = self.choice.max(usize::from(draws()));
+                let (_, actor) = &self.actors_of(Policy::freeze_briefly)[choice];
                 player.step(actor)
             }),
             task,

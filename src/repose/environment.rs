@@ -11,6 +11,7 @@ use anyhow::{Result, ensure};
 
 use super::conditions::Conditions;
 use super::divergence::{Diverged, Recorder};
+use super::physics::Physics;
 use super::randomization::{EpisodePhysics, Randomization};
 use super::reward::{Step, task_reward};
 use super::servos::Servos;
@@ -50,6 +51,17 @@ pub struct Repose {
 }
 
 impl Repose {
+    /// Goes on with these factors on quantities of the task's physics, by name. The state stays.
+    ///
+    /// # Errors
+    /// Fails if the physics has diverged.
+    pub fn vary(&mut self, factors: &[(&str, f64)]) -> Result<()> {
+        let changes = Physics::with(&self.task.hand, factors).changes(&self.task.hand);
+        let state = self.sim.state();
+        self.sim.change_scene(&self.task.scene, &changes);
+        self.sim.restore(&state)
+    }
+
     /// Creates an environment of `task`. It must be reset before it is stepped.
     pub fn new(task: &Arc<Task>) -> Self {
         Self::randomized(task, None)

@@ -188,6 +188,16 @@ impl Physics {
         )
     }
 
+    /// The physics of the scene with these factors, by the names of quantities.
+    pub(super) fn with(hand: &Hand, factors: &[(&str, f64)]) -> Self {
+        let mut physics = Self::neutral(hand);
+        for (quantity, values) in QUANTITIES.iter().zip(&mut physics.0) {
+            let known = factors.iter().find(|(name, _)| *name == quantity.name);
+            known.iter().for_each(|(_, factor)| values.fill(*factor));
+        }
+        physics
+    }
+
     /// The physics that a task sets.
     pub(super) fn of_task(config: &EnvConfig) -> Self {
         Self(

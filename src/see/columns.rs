@@ -210,6 +210,7 @@ impl Columns {
 }
 
 /// What a page says of all that it shows.
+#[derive(Clone)]
 pub struct About {
     /// What is shown, in a few words.
     pub title: String,

@@ -11,7 +11,7 @@ use serde_json::{Value, json};
 
 use super::clock::Clock;
 use super::columns::{About, Columns};
-use super::sliders::Sliders;
+use super::sliders::{Order, Sliders};
 use crate::env::End;
 use crate::evaluate::{Episodes, Player};
 use crate::os::{self, Machine, Place, Server};
@@ -20,6 +20,12 @@ use crate::sim::Camera;
 
 /// The time between two rows, s, rounded to control steps. A page interpolates between rows.
 const BETWEEN_ROWS: f64 = 0.02;
+
+/// The time for which a push acts, unless it is asked for again.
+const HELD: Duration = Duration::from_millis(400);
+
+/// The largest force of a push along an axis, N.
+const STRONGEST: f64 = 50.0;
 
 /// The time between two looks at the clock.
 const TICK: Duration = Duration::from_millis(5);
@@ -40,6 +46,8 @@ pub struct LiveActor {
 
 /// Hands on a page of this machine.
 pub struct Live {
+    about: About,
+    camera: Option<Camera>,
     columns: Columns,
     server: Arc<Server>,
     sliders: Option<Sliders>,
@@ -57,6 +65,8 @@ struct LiveHand {
     /// What the page says of its episode.
     about: Value,
     has_ended: bool,
+    /// The force on its object, N, and when it was asked for.
+    push: Option<([f64; 3], Instant)>,
     /// The sum since the last row.
     reward: TaskReward,
 }
@@ -73,13 +83,9 @@ impl Live {
         acting: &LiveActor,
         sliders: Option<Sliders>,
     ) -> Result<Self> {
-        let task = &acting.task;
-        let mut columns = Columns::new(task, camera);
-        let every = (BETWEEN_ROWS / task.config.ctrl_dt).round().max(1.0) as u64;
-        let mut more = json!({ "live": true, "hands": hands, "every": every });
-        if let Some(sliders) = &sliders {
-            more["sliders"] = sliders.described();
-        }
+        let mut columns = Columns::new(&acting.task, camera);
+        let every = (BETWEEN_ROWS / acting.task.config.ctrl_dt).round().max(1.0) as u64;
+        let more = more(hands, every, sliders.as_ref(), &acting.task);
         let page = columns.page(about, more, Vec::new());
         let key = page.key();
         let episodes = Episodes::scored(about.seed.unwrap_or(0), usize::MAX);
@@ -103,6 +109,8 @@ impl Live {
             os::say!("by a proxy: its address at {host} for port {port}, with {token} at the end");
         }
         Ok(Self {
+            about: about.clone(),
+            camera,
             columns,
             server,
             sliders,
@@ -118,16 +126,30 @@ impl Live {
         let start = Instant::now();
         let mut clock = Clock::new(self.hands[0].acting.task.config.ctrl_dt);
         let mut steps = 0_u64;
+        let mut paused = false;
         let mut begun = self.hands.len();
         loop {
             if self.server.wait_for_reader() {
                 clock.pause();
             }
-            if let Some(sliders) = self.sliders.as_ref().filter(|sliders| sliders.take_moved()) {
-                self.greet();
-                self.server.send(&event("controls", &sliders.values()));
+            let orders = self.listen();
+            for order in &orders {
+                paused = match order {
+                    Order::Pause => !paused,
+                    Order::Step => true,
+                    _ => paused,
+                };
+                self.obey(*order);
             }
-            for _ in 0..clock.steps_due(1.0) {
+            let single = orders.iter().filter(|order| **order == Order::Step);
+            let due = match paused {
+                true => {
+                    clock.pause();
+                    single.count() as u32
+                }
+                false => clock.steps_due(1.0),
+            };
+            for _ in 0..due {
                 for hand in 0..self.hands.len() {
                     if self.hands[hand].has_ended {
                         self.begin(hand, begun, next());
@@ -138,24 +160,90 @@ impl Live {
                 }
                 steps += 1;
                 if steps.is_multiple_of(self.every) {
-                    let row = self.row();
-                    self.server.send(&format!(
-                        "id: {}\ndata: {row}\n\n",
-                        start.elapsed().as_millis()
-                    ));
+                    self.send_row(start);
                 }
+            }
+            if paused && !orders.is_empty() {
+                self.send_row(start);
             }
             sleep(TICK);
         }
     }
 
+    /// Takes over what the sliders say, and returns the other orders of the page.
+    fn listen(&mut self) -> Vec<Order> {
+        let Some(sliders) = self.sliders.clone() else {
+            return Vec::new();
+        };
+        let orders = sliders.take_orders();
+        if orders.contains(&Order::Reset) {
+            sliders.reset();
+        }
+        if sliders.take_moved() {
+            self.greet();
+            self.server
+                .send(&event("controls", &json!(sliders.values())));
+            (0..self.hands.len()).for_each(|hand| self.vary(hand));
+        }
+        orders
+    }
+
+    /// Gives a hand the physics that the sliders say. A hand whose physics has diverged ends its episode.
+    fn vary(&mut self, hand: usize) {
+        let factors = self
+            .sliders
+            .as_ref()
+            .map(Sliders::factors)
+            .unwrap_or_default();
+        let hand = &mut self.hands[hand];
+        if !factors.is_empty() {
+            hand.has_ended |= hand.player.lane.env.vary(&factors).is_err();
+        }
+    }
+
+    fn obey(&mut self, order: Order) {
+        for (i, hand) in self.hands.iter_mut().enumerate() {
+            match order {
+                Order::Push(of, force) if of == i => {
+                    let force = force.map(|x| x.clamp(-STRONGEST, STRONGEST));
+                    hand.push = Some((force, Instant::now()));
+                }
+                Order::Goal => hand.player.new_goal(),
+                Order::Episode => hand.has_ended = true,
+                _ => {}
+            }
+        }
+    }
+
+    fn send_row(&mut self, start: Instant) {
+        let row = self.row();
+        let time = start.elapsed().as_millis();
+        self.server.send(&format!("id: {time}\ndata: {row}\n\n"));
+    }
+
     fn begin(&mut self, hand: usize, episode: usize, acting: LiveActor) {
+        let size = |task: &Task| task.config.cube_size_scale;
+        if size(&acting.task) != size(&self.hands[hand].acting.task) {
+            self.redraw(&acting.task);
+        }
         self.hands[hand] = LiveHand::new(acting, episode, self.episodes);
+        self.vary(hand);
         let mut about = self.hands[hand].about.clone();
         about["hand"] = hand.into();
         // First, so that a viewer who comes in between knows it.
         self.greet();
         self.server.send(&event("episode", &about));
+    }
+
+    /// Serves a page with the shapes of another task. Readers of the old one load it when they are greeted.
+    fn redraw(&mut self, task: &Arc<Task>) {
+        self.columns = Columns::new(task, self.camera);
+        let more = more(self.hands.len(), self.every, self.sliders.as_ref(), task);
+        let page = self.columns.page(&self.about, more, Vec::new());
+        self.key = page.key();
+        self.server.replace_page(page.html());
+        let hello = hello(&self.key, &self.hands, self.sliders.as_ref());
+        self.server.send(&hello);
     }
 
     fn greet(&self) {
@@ -195,14 +283,35 @@ impl LiveHand {
             acting,
             about,
             has_ended: false,
+            push: None,
             reward: TaskReward::default(),
         }
     }
 
     fn step(&mut self) {
+        if let Some((force, since)) = self.push {
+            let lasts = since.elapsed() < HELD;
+            let env = &mut self.player.lane.env;
+            let object = env.task.hand.object.body;
+            env.sim.push(object, if lasts { force } else { [0.0; 3] });
+            self.push = lasts.then_some((force, since));
+        }
         self.has_ended = (self.acting.step)(&mut self.player).is_some();
         add(&mut self.reward, self.player.lane.env.last.reward);
     }
+}
+
+/// What a live page needs to know besides what it shows.
+fn more(hands: usize, every: u64, sliders: Option<&Sliders>, task: &Task) -> Value {
+    let mut more = json!({ "live": true, "hands": hands, "every": every });
+    if let Some(sliders) = sliders {
+        more["sliders"] = sliders.described();
+        if sliders.takes_orders() {
+            let object = &task.hand.object;
+            more["object"] = json!({ "at": object.qpos, "mass": task.scene.mass(object.body) });
+        }
+    }
+    more
 }
 
 /// The first event for a viewer: the key of the page, and what is under way.
@@ -210,7 +319,7 @@ fn hello(key: &str, hands: &[LiveHand], sliders: Option<&Sliders>) -> String {
     let episodes: Value = hands.iter().map(|hand| hand.about.clone()).collect();
     let mut hello = json!({ "key": key, "episodes": episodes });
     if let Some(sliders) = sliders {
-        hello["controls"] = sliders.values();
+        hello["controls"] = json!(sliders.values());
     }
     event("hello", &hello)
 }
@@ -224,6 +333,8 @@ fn event(name: &str, data: &Value) -> String {
 mod tests {
     use super::*;
     use crate::config::Settings;
+    use crate::evaluate::Actor;
+    use crate::see::Slider;
 
     #[test]
     fn each_episode_is_played_in_the_task_of_the_policy_that_acts() {
@@ -257,5 +368,64 @@ mod tests {
         live.begin(0, 1, acting(&second));
         assert_eq!(seconds(&live), 3.0);
         assert_eq!(live.hands[0].about["seed"], "0, episode 1");
+    }
+
+    #[test]
+    fn a_page_pushes_the_object_and_changes_its_world() {
+        let task = Task::new(&Settings::new().resolve().unwrap()).unwrap();
+        let acting = LiveActor {
+            step: Rc::new(|player| player.step(&Actor::Zero)),
+            policy: None,
+            task: task.clone(),
+        };
+        let about = About {
+            title: "A hand".into(),
+            policy: None,
+            seed: None,
+        };
+        let mass = Slider::new("mass", [0.1, 3.0], 0.0, 1.0).of_quantity("cube_mass");
+        let sliders = Sliders::new(vec![mass], true);
+        let post = sliders.on_post();
+        let open = |sliders: &Sliders| {
+            Live::open((0, None), (&about, None), 1, &acting, Some(sliders.clone())).unwrap()
+        };
+        let height = |live: &mut Live| {
+            (0..10).for_each(|_| live.hands[0].step());
+            live.hands[0].player.lane.env.object().position[2]
+        };
+        let heights = [&b"[]"[..], b"{\"push\":[0,[0,0,1]]}", b"[[0,0.1]]"].map(|body| {
+            let mut live = open(&sliders);
+            post(body).unwrap();
+            for order in live.listen() {
+                live.obey(order);
+            }
+            let state = live.hands[0].player.lane.env.sim.state();
+            assert!(state.iter().all(|x| x.is_finite()));
+            height(&mut live)
+        });
+        assert!(heights[1] > heights[0] + 0.02, "{heights:?}");
+        assert_ne!(heights[2], heights[0]);
+        let mut live = open(&sliders);
+        post(b"\"reset\"").unwrap();
+        assert_eq!(live.listen(), [Order::Reset]);
+        assert_eq!(height(&mut live), heights[0], "as the task has it");
+        let env = &mut live.hands[0].player.lane.env;
+        let goal = env.goal;
+        live.obey(Order::Goal);
+        assert_ne!(live.hands[0].player.lane.env.goal, goal);
+        live.obey(Order::Episode);
+        assert!(live.hands[0].has_ended);
+        let key = live.key.clone();
+        let larger = ["env.cube_size_scale=1.2".parse().unwrap()];
+        let larger = Task::new(&Settings::new().sets(&larger).resolve().unwrap()).unwrap();
+        live.begin(
+            0,
+            1,
+            LiveActor {
+                task: larger,
+                ..acting.clone()
+            },
+        );
+        assert_ne!(live.key, key, "a page with other shapes");
     }
 }

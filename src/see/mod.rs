@@ -22,7 +22,7 @@ pub use dress::{dress, mesh_files};
 pub use film::{Film, screenshot};
 pub use live::{Live, LiveActor};
 pub use replay::Replay;
-pub use sliders::Sliders;
+pub use sliders::{Order, Slider, Sliders};
 #[cfg(feature = "viewer")]
 pub use window::Window;
 

@@ -1,57 +1,125 @@
-//! The sliders of a page, which move the actuators of a hand.
+//! The sliders and buttons of a page, by which its readers move a hand or change its world.
 
+use std::mem::take;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
+use serde::Deserialize;
 use serde_json::{Value, json};
 
 use crate::os::OnPost;
 use crate::repose::Task;
 
-/// The answer to a request that moves none of the actuators.
-const MALFORMED: &str = "Send a list of pairs: the number of an actuator, and a finite value.";
+/// The answer to a request that asks for nothing.
+const MALFORMED: &str = "Send a list of pairs: the number of a slider, and a finite value; or a push, or the name of a button.";
 
-/// A slider for each actuator, in action order. An actuator obeys its slider from the first time that this is moved.
+/// The most orders that wait.
+const MOST_ORDERS: usize = 64;
+
+/// The sliders of a page, and the orders that came from it.
 #[derive(Clone)]
-pub struct Sliders(Arc<Mutex<SliderStates>>);
+pub struct Sliders(Arc<Mutex<State>>);
 
-struct SliderStates {
+struct State {
     sliders: Vec<Slider>,
-    /// Whether one has moved since this was last asked.
+    /// Whether the page may also push the object and press buttons.
+    takes_orders: bool,
+    orders: Vec<Order>,
+    /// Whether a slider has moved since this was last asked.
     moved: bool,
 }
 
-struct Slider {
-    name: String,
-    range: [f64; 2],
-    /// In the unit of the range. `None` if it was not moved yet.
+/// A slider.
+pub struct Slider {
+    /// What the page calls it.
+    pub name: String,
+    /// Its ends.
+    pub range: [f64; 2],
+    /// The distance between values, or 0 for any value.
+    pub step: f64,
+    /// Where it is until it is moved, and again after a reset.
+    pub start: f64,
+    /// The quantity of the physics on which it is a factor, at once.
+    pub quantity: Option<&'static str>,
     value: Option<f64>,
 }
 
+/// What a page asks for besides values.
+#[derive(Clone, Copy, Debug, PartialEq, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Order {
+    /// Pushes the object of a hand with this force in the world frame, N, for a moment.
+    Push(usize, [f64; 3]),
+    /// Stops all hands, or lets them go on.
+    Pause,
+    /// Stops all hands after one more control step.
+    Step,
+    /// Draws another goal for each hand.
+    Goal,
+    /// Begins another episode with each hand.
+    Episode,
+    /// Puts all sliders back.
+    Reset,
+}
+
+/// The body of a request.
+#[derive(Deserialize)]
+#[serde(untagged)]
+enum Said {
+    Moves(Vec<(usize, f64)>),
+    Order(Order),
+}
+
 impl Slider {
+    /// Creates a slider that has not moved.
+    pub fn new(name: &str, range: [f64; 2], step: f64, start: f64) -> Self {
+        Self {
+            name: name.into(),
+            range,
+            step,
+            start,
+            quantity: None,
+            value: None,
+        }
+    }
+
+    /// The same slider as a factor on a quantity of the physics.
+    #[must_use]
+    pub fn of_quantity(self, quantity: &'static str) -> Self {
+        Self {
+            quantity: Some(quantity),
+            ..self
+        }
+    }
+
     fn value(&self) -> f64 {
-        let [low, high] = self.range;
-        self.value.unwrap_or(f64::midpoint(low, high))
+        self.value.unwrap_or(self.start)
     }
 }
 
 impl Sliders {
-    /// Creates a slider for each actuator of a task's hand.
-    pub fn new(task: &Task) -> Self {
-        let hand = &task.hand;
-        let actuators = hand.parts.actuators.iter().zip(&hand.actuators);
-        let sliders = actuators.map(|(name, actuator)| Slider {
-            name: name.clone(),
-            range: actuator.range,
-            value: None,
-        });
-        let state = SliderStates {
-            sliders: sliders.collect(),
+    /// Creates these sliders. The page may push the object and press buttons as well, if it `takes_orders`.
+    pub fn new(sliders: Vec<Slider>, takes_orders: bool) -> Self {
+        let state = State {
+            sliders,
+            takes_orders,
+            orders: Vec::new(),
             moved: false,
         };
         Self(Arc::new(state.into()))
     }
 
-    /// Changes an action to what the sliders ask for: -1 and 1 are the ends of the range of an actuator.
+    /// A slider for each actuator of a task's hand, in action order. An actuator obeys its slider from the first time that this is moved.
+    pub fn of_actuators(task: &Task) -> Self {
+        let hand = &task.hand;
+        let actuators = hand.parts.actuators.iter().zip(&hand.actuators);
+        let sliders = actuators.map(|(name, actuator)| {
+            let [low, high] = actuator.range;
+            Slider::new(name, actuator.range, 0.0, f64::midpoint(low, high))
+        });
+        Self::new(sliders.collect(), false)
+    }
+
+    /// Changes an action to what the sliders of actuators ask for: -1 and 1 are the ends of the range of an actuator.
     pub fn change(&self, action: &mut [f32]) {
         for (action, slider) in action.iter_mut().zip(&self.state().sliders) {
             let [low, high] = slider.range;
@@ -61,21 +129,37 @@ impl Sliders {
         }
     }
 
-    /// What happens on a request of the page: `[[actuator, value], …]`.
+    /// What happens on a request of the page: `[[slider, value], …]`, `{"push": [hand, [x, y, z]]}`, or the name of a button.
     pub(super) fn on_post(&self) -> OnPost {
         let own = self.clone();
         Box::new(move |body| {
-            let moves: Vec<(usize, f64)> = serde_json::from_slice(body).map_err(|_| MALFORMED)?;
+            let said = serde_json::from_slice(body).map_err(|_| MALFORMED)?;
             let mut state = own.state();
+            let moves: Vec<(usize, f64)> = match said {
+                Said::Moves(moves) => moves,
+                Said::Order(order) => {
+                    let is_finite = match order {
+                        Order::Push(_, force) => force.iter().all(|x| x.is_finite()),
+                        _ => true,
+                    };
+                    if !state.takes_orders || !is_finite {
+                        return Err(MALFORMED);
+                    }
+                    if state.orders.len() < MOST_ORDERS {
+                        state.orders.push(order);
+                    }
+                    return Ok(());
+                }
+            };
             let count = state.sliders.len();
             if moves
                 .iter()
-                .any(|(actuator, value)| *actuator >= count || !value.is_finite())
+                .any(|(slider, value)| *slider >= count || !value.is_finite())
             {
                 return Err(MALFORMED);
             }
-            for (actuator, value) in moves {
-                let slider = &mut state.sliders[actuator];
+            for (slider, value) in moves {
+                let slider = &mut state.sliders[slider];
                 let [low, high] = slider.range;
                 slider.value = Some(value.max(low).min(high));
                 state.moved = true;
@@ -86,24 +170,50 @@ impl Sliders {
 
     /// Whether one has moved since the last call.
     pub(super) fn take_moved(&self) -> bool {
-        std::mem::take(&mut self.state().moved)
+        take(&mut self.state().moved)
+    }
+
+    /// The orders since the last call.
+    pub(super) fn take_orders(&self) -> Vec<Order> {
+        take(&mut self.state().orders)
+    }
+
+    /// Puts all sliders back.
+    pub(super) fn reset(&self) {
+        let mut state = self.state();
+        state
+            .sliders
+            .iter_mut()
+            .for_each(|slider| slider.value = None);
+        state.moved = true;
     }
 
     /// The value of each.
-    pub(super) fn values(&self) -> Value {
+    pub fn values(&self) -> Vec<f64> {
         self.state().sliders.iter().map(Slider::value).collect()
+    }
+
+    /// The factors on quantities of the physics.
+    pub(super) fn factors(&self) -> Vec<(&'static str, f64)> {
+        let factor = |slider: &Slider| Some((slider.quantity?, slider.value()));
+        self.state().sliders.iter().filter_map(factor).collect()
     }
 
     /// What a page needs to show them.
     pub(super) fn described(&self) -> Value {
         let described = |slider: &Slider| {
             let [low, high] = slider.range;
-            json!({ "name": slider.name, "low": low, "high": high, "value": slider.value() })
+            json!({ "name": slider.name, "low": low, "high": high, "step": slider.step, "value": slider.start })
         };
         self.state().sliders.iter().map(described).collect()
     }
 
-    fn state(&self) -> MutexGuard<'_, SliderStates> {
+    /// Whether the page may also push the object and press buttons.
+    pub(super) fn takes_orders(&self) -> bool {
+        self.state().takes_orders
+    }
+
+    fn state(&self) -> MutexGuard<'_, State> {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
@@ -117,7 +227,7 @@ mod tests {
     fn what_a_page_sends_moves_actuators_within_their_ranges_and_nothing_else_does() {
         let config = Config::default();
         let task = Task::new(&config).unwrap();
-        let sliders = Sliders::new(&task);
+        let sliders = Sliders::of_actuators(&task);
         let post = sliders.on_post();
         let [low, high] = task.hand.actuators[3].range;
         let acted = || {
@@ -149,5 +259,34 @@ mod tests {
         post(b"[[3,1e300]]").unwrap();
         assert_eq!(acted()[3], 1.0);
         assert_eq!(sliders.values()[3], high);
+    }
+    #[test]
+    fn a_page_pushes_and_presses_only_where_it_may() {
+        let forbidden = Sliders::new(Vec::new(), false).on_post();
+        let sliders = Sliders::new(vec![Slider::new("friction", [0.5, 2.0], 0.0, 1.0)], true);
+        let post = sliders.on_post();
+        let bodies = ["\"goal\"", "{\"push\":[1,[0.5,0,-1]]}"];
+        for body in bodies {
+            assert!(forbidden(body.as_bytes()).is_err(), "{body}");
+            post(body.as_bytes()).unwrap();
+        }
+        assert_eq!(
+            sliders.take_orders(),
+            [Order::Goal, Order::Push(1, [0.5, 0.0, -1.0])]
+        );
+        for bad in [
+            "\"fly\"",
+            "{\"push\":[1,[1e999,0,0]]}",
+            "{\"push\":[-1,[0,0,0]]}",
+            "{\"push\":1}",
+        ] {
+            assert!(post(bad.as_bytes()).is_err(), "{bad}");
+        }
+        (0..100).for_each(|_| post(b"\"step\"").unwrap());
+        assert_eq!(sliders.take_orders().len(), MOST_ORDERS);
+        post(b"[[0,9]]").unwrap();
+        assert_eq!(sliders.values(), [2.0]);
+        sliders.reset();
+        assert!(sliders.values() == [1.0] && sliders.take_moved());
     }
 }

@@ -187,6 +187,11 @@ impl Scene {
         radii.fold(0.0, f64::max)
     }
 
+    /// The mass of a body and of those that it carries, kg.
+    pub fn mass(&self, Body(id): Body) -> f64 {
+        self.model.body_subtreemass()[id]
+    }
+
     /// The number of controls.
     pub fn controls(&self) -> usize {
         self.model.nu() as usize

@@ -794,7 +794,8 @@ fn a_slider_moves_an_actuator_and_only_the_page_can_move_it() {
         live.events().next("hello")["controls"][3].as_f64().unwrap(),
         high
     );
-    // Nothing that `play` shows can be changed.
+    assert_eq!(post(&own, "\"goal\""), "400", "it moves actuators only");
+    // What `play` shows is touched by its own page only.
     let play = Live::start(
         folder.path(),
         &["play", "--ckpt", "zero", "--web", "0", "--plain"],
@@ -802,7 +803,13 @@ fn a_slider_moves_an_actuator_and_only_the_page_can_move_it() {
     let request = format!(
         "POST /controls HTTP/1.1\r\nHost: localhost\r\n{own}Content-Length: 7\r\n\r\n[[3,9]]"
     );
-    assert_eq!(status(&play.ask(request.as_bytes())), "404");
+    assert_eq!(status(&play.ask(request.as_bytes())), "403", "{request}");
+    let touched = request
+        .replace(&live.port.to_string(), &play.port.to_string())
+        .replace("Host: localhost", &format!("Host: 127.0.0.1:{}", play.port))
+        .replace("Content-Length: 7", "Content-Length: 6")
+        .replace("[[3,9]]", "\"goal\"");
+    assert_eq!(status(&play.ask(touched.as_bytes())), "204", "{touched}");
 }
 
 #[test]
@@ -944,7 +951,7 @@ fn a_server_answers_what_is_no_request_of_its_page_and_serves_others_meanwhile()
             "403",
         ),
         ("GET /../../etc/passwd HTTP/1.1", local, "404"),
-        ("GET /controls HTTP/1.1", local, "404"),
+        ("GET /controls HTTP/1.1", local, "405"),
         (
             "POST / HTTP/1.1",
             "Host: localhost\r\nContent-Length: 0\r\n",

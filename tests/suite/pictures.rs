@@ -327,14 +327,6 @@ fn what_is_only_seen_does_not_change_the_physics_by_a_bit() {
     same_physics(&plain, &dressed);
 }
 
-/// The number of shapes that a page draws of a task.
-fn drawn(task: &Task) -> usize {
-    task.scene.drawing(None, None).scene["geoms"]
-        .as_array()
-        .unwrap()
-        .len()
-}
-
 /// Steps both tasks under the same actions, and compares every bit.
 fn same_physics(plain: &Arc<Task>, dressed: &Arc<Task>) {
     let (mut plain, mut dressed): ((Repose, Vec<f32>), (Repose, Vec<f32>)) =
