@@ -18,6 +18,9 @@ import mujoco
 import numpy as np
 import onnxruntime
 
+if not hasattr(mujoco.MjModel, "dof_dampingpoly"):
+    sys.exit(f"error: mujoco {mujoco.__version__} is too old: `pip install -r requirements.txt` installs one that is new enough")
+
 SCENE = pathlib.Path(__file__).parents[2] / "assets/shadow_hand/scene.xml"
 # Settings that older files do not have.
 NOMINAL = dict.fromkeys(["hand_mass_scale", "cube_size_scale", "gains_scale", "damping_scale", "frictionloss_scale"], 1.0)

@@ -106,13 +106,15 @@ pub fn furnished(
         let body = spec
             .body_mut(name)
             .context("a body of the compiled scene")?;
-        for (mark, [red, green, blue]) in marks.into_iter().zip(FACES) {
+        for ((kind, size, position, orientation), [red, green, blue]) in
+            marks.into_iter().zip(FACES)
+        {
             only_seen(body)
-                .with_type(mark.kind)
-                .with_size(mark.size)
-                .with_pos(mark.position)
+                .with_type(kind)
+                .with_size(size)
+                .with_pos(position)
                 // Regardless of the defaults of its class.
-                .with_quat(mark.orientation)
+                .with_quat(orientation)
                 .with_rgba([red, green, blue, opacity])
                 .with_group(VISUAL);
         }
@@ -127,76 +129,45 @@ pub fn furnished(
     Ok(Some(furnished))
 }
 
-/// A coloured shape that shows how an object is turned.
-struct Mark {
-    kind: MjtGeomBase,
-    size: [f64; 3],
-    position: [f64; 3],
-    orientation: quat::Quat,
-}
+/// A coloured shape that shows how an object is turned: its kind, size, position and orientation.
+type Mark = (MjtGeomBase, [f64; 3], [f64; 3], quat::Quat);
 
 /// A mark for each colour of [`FACES`]: plates on a box, dots on a round shape, and rods along the axes of anything else. An object with a
 /// material has none.
 fn marks(model: &MjModel, body: usize) -> Option<Vec<Mark>> {
-    let frames = frames_within(model, body);
-    let shapes = geoms_within(model, &frames);
-    if shapes.is_empty()
-        || shapes
-            .iter()
-            .any(|&(geom, _)| model.geom_matid()[geom] >= 0)
-    {
-        return None;
-    }
+    let shapes = geoms_within(model, &frames_within(model, body));
+    let &(first, place) = shapes.first()?;
     let [low, high] = box_around(model, &shapes);
-    let middle = [0, 1, 2].map(|axis| 0.5 * (low[axis] + high[axis]));
     let half = [0, 1, 2].map(|axis| 0.5 * (high[axis] - low[axis]));
     let least = half.into_iter().fold(f64::INFINITY, f64::min);
-    let [(geom, place), ..] = shapes[..] else {
-        return None;
-    };
     let is_simple = shapes.len() == 1 && place == ([0.0; 3], quat::IDENTITY);
     let mark = |face: usize| {
         let axis = face / 2;
-        let sign = if face % 2 == 0 { 1.0 } else { -1.0 };
-        let at = |distance: f64| {
-            let mut position = middle;
-            position[axis] += sign * distance;
-            position
-        };
-        match model.geom_type()[geom] {
+        let (kind, size, distance, orientation) = match model.geom_type()[first] {
             mjGEOM_BOX if is_simple => {
                 let mut size = half.map(|half| 0.88 * half);
                 size[axis] = PLATE * half[axis];
-                Mark {
-                    kind: mjGEOM_BOX,
-                    size,
-                    position: at(half[axis]),
-                    orientation: quat::IDENTITY,
-                }
+                (mjGEOM_BOX, size, half[axis], quat::IDENTITY)
             }
             mjGEOM_SPHERE | mjGEOM_ELLIPSOID | mjGEOM_CAPSULE | mjGEOM_CYLINDER if is_simple => {
                 let [radius, height, depth] = DOT.map(|part| part * least);
                 let mut size = [radius; 3];
                 size[axis] = height;
-                Mark {
-                    kind: mjGEOM_ELLIPSOID,
-                    size,
-                    position: at(half[axis] - depth),
-                    orientation: quat::IDENTITY,
-                }
+                (mjGEOM_ELLIPSOID, size, half[axis] - depth, quat::IDENTITY)
             }
             _ => {
-                let length = half[axis] + ROD[0] * least;
-                Mark {
-                    kind: mjGEOM_CAPSULE,
-                    size: [ROD[1] * least, 0.5 * length, 0.0],
-                    position: at(0.5 * length),
-                    orientation: ALONG[axis],
-                }
+                let middle = 0.5 * (half[axis] + ROD[0] * least);
+                let size = [ROD[1] * least, middle, 0.0];
+                (mjGEOM_CAPSULE, size, middle, ALONG[axis])
             }
-        }
+        };
+        let mut position = [0, 1, 2].map(|axis| low[axis] + half[axis]);
+        position[axis] += if face % 2 == 0 { distance } else { -distance };
+        (kind, size, position, orientation)
     };
-    Some((0..FACES.len()).map(mark).collect())
+    let is_plain = |&(geom, _): &(usize, Placed)| model.geom_matid()[geom] < 0;
+    let all = shapes.iter().all(is_plain);
+    all.then(|| (0..FACES.len()).map(mark).collect())
 }
 
 /// The corners of a box along the axes around shapes that have these places, m.

@@ -493,7 +493,7 @@ fn parts_without_a_name_are_called_by_what_they_drive_or_what_moves_them() {
         "{:?}",
         parts.fingertips
     );
-    assert!(named.notes().concat().contains("2 parts of"));
+    assert!(named.notes().concat().contains("parts without a name in"));
     let (_other, model) = placed(THREE_FINGERS);
     let own = Task::new(&crate::support::config(&[&model])).unwrap();
     assert_eq!(own.scene.fingerprint(), named.scene.fingerprint());
