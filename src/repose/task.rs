@@ -196,7 +196,7 @@ impl Task {
         }
         if self.unnamed > 0 {
             notes.push(format!(
-                "parts without a name in {scene}, {}: they are called `servo of`, `joint of` or `link of` their neighbours",
+                "parts without a name in {scene}: {}. They are called `servo of`, `joint of` or `link of` their neighbours",
                 self.unnamed
             ));
         }

@@ -207,7 +207,7 @@ impl Scene {
         let kind = self.model.jnt_type()[id];
         ensure!(
             kind == mjJNT_HINGE,
-            "joint `{name}` must be a hinge, but is {kind:?}"
+            "joint `{name}` must be a hinge: remove slides and ball joints, and what drives them, from the hand"
         );
         ensure!(
             self.model.jnt_limited()[id],
@@ -343,7 +343,7 @@ impl Scene {
         for (holds, what) in [
             (
                 is_servo,
-                "be a position servo (<position>): its control is an angle",
+                "be a position servo (<position>): its control is an angle, and its force is kp times what is left to it",
             ),
             (
                 !is_disabled,
