@@ -16,7 +16,7 @@
 //! |---|---|---|
 //! | `main` | runs a command, prints errors, sets the exit code | bench, cli, export, manual, os, play, plot, ranks, runs, train, view |
 //! | `processor` | the sentence about a processor that MuJoCo cannot run on; of the program only | - |
-//! | [`mod@train`] | the training loop: collect, learn, evaluate, report, save | agent, check, cli, config, env, evaluate, load, os, ppo, quat, ranks, repose, rng, run, schedule, sim, tags |
+//! | [`mod@train`] | the training loop: collect, learn, evaluate, report, save | agent, check, cli, config, evaluate, load, os, ppo, ranks, repose, run, schedule, sim, tags |
 //! | [`mod@play`] | plays a policy: in a window or a browser, as a film or an HTML file, or for its score as a table or JSON | cli, config, evaluate, goal_times, load, os, ppo, repose, robustness, run, see, sim, trace |
 //! | [`mod@check`] | whether a hand can learn at all, before it is trained | config, env, quat, repose, rng |
 //! | [`mod@robustness`] | the score of a policy under changed physics, noise and delays | config, draw, evaluate, os, repose |

@@ -9,6 +9,7 @@ mod errors;
 mod hands;
 mod pictures;
 mod policy;
+mod scores;
 mod settings;
 mod workers;
 
@@ -21,9 +22,11 @@ mod _native {
     #[pymodule_export]
     use super::hands::Hands;
     #[pymodule_export]
-    use super::policy::{Policy, evaluate, file_of};
+    use super::policy::Policy;
     #[pymodule_export]
     use super::prepare;
+    #[pymodule_export]
+    use super::scores::{evaluate, file_of};
     use super::{PyModule, PyResult, flush_before_the_end};
 
     #[pymodule_init]

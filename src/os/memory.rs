@@ -1,9 +1,6 @@
-//! The memory of this process and of the machine.
-
-#![expect(unsafe_code, reason = "calls of the C library that only report")]
+//! The memory of this process and of the machine, as Linux reports it.
 
 use std::fs;
-use std::mem::zeroed;
 
 /// Where Linux says how much memory the processes of this container may use.
 const LIMITS: [&str; 2] = [
@@ -11,32 +8,28 @@ const LIMITS: [&str; 2] = [
     "/sys/fs/cgroup/memory/memory.limit_in_bytes",
 ];
 
-/// The most memory that this process has used at once, bytes.
-pub fn used() -> f64 {
-    // SAFETY: the system fills this structure, which consists of numbers.
-    let usage = unsafe {
-        let mut usage = zeroed();
-        libc::getrusage(libc::RUSAGE_SELF, &raw mut usage);
-        usage
-    };
-    let unit = if cfg!(target_os = "macos") {
-        1.0
-    } else {
-        1024.0
-    };
-    usage.ru_maxrss as f64 * unit
+/// The number in kB behind `name` in a file of such lines, in bytes.
+fn reported(path: &str, name: &str) -> Option<f64> {
+    let text = fs::read_to_string(path).ok()?;
+    let mut lines = text.lines();
+    let line = lines.find_map(|line| line.strip_prefix(name))?;
+    let number: f64 = line.split_whitespace().next()?.parse().ok()?;
+    Some(1024.0 * number)
 }
 
-/// The memory that all processes of the machine may use, or of this container, bytes.
-pub fn of_machine() -> f64 {
-    // SAFETY: these return numbers.
-    let [pages, size] = [libc::_SC_PHYS_PAGES, libc::_SC_PAGESIZE]
-        .map(|what| unsafe { libc::sysconf(what) } as f64);
+/// The most memory that this process has used at once, bytes. `None` on other systems.
+pub fn used() -> Option<f64> {
+    reported("/proc/self/status", "VmHWM:")
+}
+
+/// The memory that all processes of the machine may use, or of this container, bytes. `None` on other systems.
+pub fn of_machine() -> Option<f64> {
+    let all = reported("/proc/meminfo", "MemTotal:")?;
     let limits = LIMITS.iter().filter_map(|path| {
         let text = fs::read_to_string(path).ok()?;
         text.trim().parse().ok()
     });
-    limits.fold(pages * size, f64::min)
+    Some(limits.fold(all, f64::min))
 }
 
 #[cfg(test)]
@@ -45,9 +38,12 @@ mod tests {
 
     #[test]
     fn a_process_uses_some_of_the_memory_of_its_machine() {
-        let before = used();
+        let Some((before, machine)) = used().zip(of_machine()) else {
+            assert!(!fs::exists("/proc/self/status").unwrap());
+            return;
+        };
         let room = std::hint::black_box(vec![1_u8; 200 << 20]);
-        assert!(used() >= room.len() as f64 && before > 0.0);
-        assert!(used() < of_machine());
+        let after = used().unwrap();
+        assert!(0.0 < before && room.len() as f64 <= after && after < machine);
     }
 }

@@ -61,13 +61,8 @@ impl Task {
     pub fn with_files(all: &Config, known: &Arc<SceneFiles>) -> Result<Arc<Self>> {
         let file = all.env.model_file();
         let mut config = all.env.clone();
-        let mut plain = Compilation::plain(config.sim_dt, config.cone).in_memory(file, known)?;
-        let mut as_it_is = Scene::load(file, &plain)?;
-        let unnamed = as_it_is.unnamed();
-        if unnamed > 0 {
-            plain.names_parts = true;
-            as_it_is = Scene::load(file, &plain)?;
-        }
+        let plain = Compilation::plain(config.sim_dt, config.cone).in_memory(file, known)?;
+        let (plain, as_it_is, unnamed) = named(file, plain)?;
         let mut parts = Hand::find(&as_it_is, &all.hand).with_context(|| origin(file))?;
         let compilation = Compilation {
             object: parts.object.clone(),
@@ -200,6 +195,22 @@ impl Task {
                 self.unnamed
             ));
         }
+        notes.extend(self.notes_on_object());
+        let object = &self.hand.parts.object;
+        notes.push(match place == own {
+            true => {
+                format!("`{object}` starts where {scene} has it: env.goal_position = {place:?}")
+            }
+            false => format!(
+                "env.goal_position = {place:?} replaces the place of `{object}` in {scene}, {own:?}"
+            ),
+        });
+        notes
+    }
+
+    /// What makes its object or its joints special.
+    fn notes_on_object(&self) -> Vec<String> {
+        let mut notes = Vec::new();
         let alike = self.scene.symmetry(self.hand.object.body).len();
         let object = &self.hand.parts.object;
         if alike < CUBE_ROTATIONS.len() {
@@ -225,14 +236,6 @@ impl Task {
                 "{looped} joints are in loops, which equality constraints close: they start without noise"
             ));
         }
-        notes.push(match place == own {
-            true => {
-                format!("`{object}` starts where {scene} has it: env.goal_position = {place:?}")
-            }
-            false => format!(
-                "env.goal_position = {place:?} replaces the place of `{object}` in {scene}, {own:?}"
-            ),
-        });
         notes
     }
 
@@ -359,6 +362,24 @@ impl Task {
         Ok(Scene::load(config.model_file(), &compilation)?
             .varied(&Physics::of_task(config).changes(&self.hand)))
     }
+}
+
+/// Loads a scene in which each part has a name, and counts the parts that have none of their own.
+///
+/// # Errors
+/// Fails as [`Scene::load`] does.
+fn named(file: Option<&Path>, plain: Compilation) -> Result<(Compilation, Scene, usize)> {
+    let scene = Scene::load(file, &plain)?;
+    let unnamed = scene.unnamed();
+    if unnamed == 0 {
+        return Ok((plain, scene, 0));
+    }
+    let naming = Compilation {
+        names_parts: true,
+        ..plain
+    };
+    let scene = Scene::load(file, &naming)?;
+    Ok((naming, scene, unnamed))
 }
 
 /// Takes the numbers of joints and actuators from the hand, unless they are named.

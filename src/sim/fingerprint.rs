@@ -4,7 +4,6 @@ use std::fmt::Debug;
 
 use mujoco_rs::prelude::MjModel;
 
-use super::Scene;
 use super::constants::*;
 use super::placing::touches;
 
@@ -21,16 +20,9 @@ macro_rules! unusual {
     };
 }
 
-impl Scene {
-    /// A checksum (CRC-32), as hexadecimal digits, of everything in a scene that changes its motion. Geoms that collide with
-    /// nothing are left out, and so are sensors, keyframes and plugins. The quantities of the second list count only where they are
-    /// unusual, so that the checksum of other scenes stays the same when the list grows.
-    pub fn fingerprint(&self) -> String {
-        fingerprint(&self.model)
-    }
-}
-
-/// The checksum of a compiled scene.
+/// A checksum (CRC-32), as hexadecimal digits, of everything in a scene that changes its motion. Geoms that collide with
+/// nothing are left out, and so are sensors, keyframes and plugins. The quantities of the second list count only where they are
+/// unusual, so that the checksum of other scenes stays the same when the list grows.
 pub(super) fn fingerprint(model: &MjModel) -> String {
     let mut hasher = crc32fast::Hasher::new();
     let mut take = |parts: &[&dyn Debug]| {

@@ -7,6 +7,7 @@ use std::path::Path;
 use anyhow::{Context, Result};
 use mujoco_rs::prelude::{MjData, MjModel, MjtGeomBase};
 use mujoco_rs::wrappers::SpecItem;
+use mujoco_rs::wrappers::mj_editing::MjsBody;
 use std::f64::consts::FRAC_1_SQRT_2;
 
 use super::compilation::{Compilation, VISUAL, only_seen};
@@ -106,18 +107,7 @@ pub fn furnished(
         let body = spec
             .body_mut(name)
             .context("a body of the compiled scene")?;
-        for ((kind, size, position, orientation), [red, green, blue]) in
-            marks.into_iter().zip(FACES)
-        {
-            only_seen(body)
-                .with_type(kind)
-                .with_size(size)
-                .with_pos(position)
-                // Regardless of the defaults of its class.
-                .with_quat(orientation)
-                .with_rgba([red, green, blue, opacity])
-                .with_group(VISUAL);
-        }
+        add_marks(body, marks, opacity);
     }
     let mut furnished = compilation.finish(spec)?;
     if has_no_camera {
@@ -131,6 +121,20 @@ pub fn furnished(
 
 /// A coloured shape that shows how an object is turned: its kind, size, position and orientation.
 type Mark = (MjtGeomBase, [f64; 3], [f64; 3], quat::Quat);
+
+/// Puts marks on a body, in the colours of [`FACES`].
+fn add_marks(body: &mut MjsBody, marks: Vec<Mark>, opacity: f32) {
+    for ((kind, size, position, orientation), [red, green, blue]) in marks.into_iter().zip(FACES) {
+        only_seen(body)
+            .with_type(kind)
+            .with_size(size)
+            .with_pos(position)
+            // Regardless of the defaults of its class.
+            .with_quat(orientation)
+            .with_rgba([red, green, blue, opacity])
+            .with_group(VISUAL);
+    }
+}
 
 /// A mark for each colour of [`FACES`]: plates on a box, dots on a round shape, and rods along the axes of anything else. An object with a
 /// material has none.

@@ -9,6 +9,7 @@ use mujoco_rs::prelude::{MjModel, MjtDisableBit, MjtObjBase};
 use super::Look;
 use super::compilation::{Compilation, Cone, origin};
 use super::constants::*;
+use super::fingerprint::fingerprint;
 use super::finite::not_finite;
 use super::furnish::furnished;
 use super::placing::{frames_within, geoms_within, touches};
@@ -190,6 +191,11 @@ impl Scene {
     /// The mass of a body and of those that it carries, kg.
     pub fn mass(&self, Body(id): Body) -> f64 {
         self.model.body_subtreemass()[id]
+    }
+
+    /// A checksum of everything that changes its motion. See [`fingerprint`].
+    pub fn fingerprint(&self) -> String {
+        fingerprint(&self.model)
     }
 
     /// The number of controls.

@@ -13,9 +13,9 @@ const ENVIRONMENT: usize = 224 << 10;
 /// The models besides one for each thread: one for each size of the object.
 const MODELS: usize = 5;
 
-/// The memory that the training needs in this process, and that the machine has, GiB. The need is an estimate, before the
-/// environments are stepped.
-pub fn need(session: &Session) -> [f64; 2] {
+/// The memory that the training needs in this process, and that the machine has, GiB, where the system says them. The need is an
+/// estimate, before the environments are stepped.
+pub fn need(session: &Session) -> Option<[f64; 2]> {
     let Session {
         config,
         task,
@@ -34,5 +34,6 @@ pub fn need(session: &Session) -> [f64; 2] {
         + config.run.eval_episodes * (ENVIRONMENT + CONTACTS)
         + models
         + learner;
-    [memory::used() + more as f64, memory::of_machine()].map(|bytes| bytes / f64::from(1 << 30))
+    let both = [memory::used()? + more as f64, memory::of_machine()?];
+    Some(both.map(|bytes| bytes / f64::from(1 << 30)))
 }
