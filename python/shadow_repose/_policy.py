@@ -15,8 +15,6 @@ from ._settings import flat, floats, number, pairs
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
-    from .envs import Env, VectorEnv
-
 
 _native.prepare(np.zeros(1, np.float32))  # which Python could not do while it ends
 
@@ -27,7 +25,7 @@ ACTIVATIONS = ("elu", "relu", "tanh")
 """What may follow a hidden layer."""
 
 
-def task_of(envs: VectorEnv | Env) -> _native.Hands:
+def task_of(envs: Any) -> _native.Hands:
     """Returns the extension module's part of environments."""
     vector = getattr(envs, "unwrapped", envs)
     vector = getattr(vector, "vector", vector)
@@ -110,7 +108,7 @@ class Policy:
         layers: Sequence[tuple[ArrayLike, ArrayLike]],
         activation: str,
         *,
-        task: VectorEnv | Env,
+        task: Any,
         normalizer: Normalizer | None = None,
         std: ArrayLike = 1.0,
     ) -> Policy:
@@ -120,7 +118,7 @@ class Policy:
             layers: weights `[outputs, inputs]` and biases `[outputs]` of each layer, from the observation to the mean actions. The last
                 layer has no activation: environments clip actions to [-1, 1].
             activation: `"elu"`, `"relu"` or `"tanh"`, after each layer but the last.
-            task: the environments in which it was learnt. Their settings, scene and steps so far go into the file.
+            task: the environments in which it was learnt, a `VectorEnv` or an `Env`. Their settings, scene and steps so far go into the file.
             normalizer: how it normalises observations. None: not at all.
             std: the standard deviation of its actions, or of each `[A]`, where actions are drawn.
 
@@ -150,7 +148,7 @@ class Policy:
 
     @classmethod
     def from_torch(
-        cls, module: Any, *, task: VectorEnv | Env, normalizer: Normalizer | None = None, std: ArrayLike = 1.0
+        cls, module: Any, *, task: Any, normalizer: Normalizer | None = None, std: ArrayLike = 1.0
     ) -> Policy:
         """Returns a policy from a module of PyTorch that maps observations to mean actions: linear layers and one kind of activation.
 
@@ -242,7 +240,7 @@ class Policy:
 def evaluate(
     policy: Policy | str | os.PathLike[str] | Callable[[np.ndarray], ArrayLike] = "builtin",
     *,
-    envs: VectorEnv | Env | None = None,
+    envs: Any = None,
     episodes: int = 256,
     seed: int = 0,
     set: Mapping[str, Any] | None = None,
@@ -254,7 +252,7 @@ def evaluate(
     Args:
         policy: a policy, a place that `Policy.load` takes, or a function of your own. The function gets observations `[N, O]`, float32,
             of up to 64 episodes, and returns actions `[N, A]`. It is called from another thread.
-        envs: environments whose task is played, by default the policy's own. They are not stepped.
+        envs: a `VectorEnv` or an `Env` whose task is played, by default the policy's own. It is not stepped.
         episodes: how many episodes are played.
         seed: the seed from which they are drawn.
         set: settings that replace those of its task, e.g. `{"env.friction_scale": 0.8}`. Without `envs`, the task

@@ -5,7 +5,7 @@
 use std::path::Path;
 
 use anyhow::{Context, Result};
-use mujoco_rs::prelude::{MjData, MjModel, MjtGeomBase};
+use mujoco_rs::prelude::{MjData, MjModel, MjSpec, MjtGeomBase};
 use mujoco_rs::wrappers::SpecItem;
 use mujoco_rs::wrappers::mj_editing::MjsBody;
 use std::f64::consts::FRAC_1_SQRT_2;
@@ -77,6 +77,30 @@ pub fn furnished(
         return Ok(None);
     }
     let [low, high] = space_of(model, goal);
+    let lacking = [is_dark, has_no_sky, has_no_floor];
+    add_surroundings(&mut spec, lacking, low[2] - BELOW);
+    for (name, marks, opacity) in marked {
+        let body = spec
+            .body_mut(name)
+            .context("a body of the compiled scene")?;
+        add_marks(body, marks, opacity);
+    }
+    let mut furnished = compilation.finish(spec)?;
+    if has_no_camera {
+        let statistics = furnished.stat_mut();
+        statistics.center = [0, 1, 2].map(|axis| 0.5 * (low[axis] + high[axis]));
+        let squares: f64 = (0..3).map(|axis| (high[axis] - low[axis]).powi(2)).sum();
+        statistics.extent = squares.sqrt();
+    }
+    Ok(Some(furnished))
+}
+
+/// Adds a light, a sky, and a floor at this height, if they are lacking.
+fn add_surroundings(
+    spec: &mut MjSpec,
+    [is_dark, has_no_sky, has_no_floor]: [bool; 3],
+    height: f64,
+) {
     if is_dark {
         spec.world_body_mut()
             .add_light()
@@ -98,25 +122,11 @@ pub fn furnished(
         only_seen(spec.world_body_mut())
             .with_type(mjGEOM_PLANE)
             .with_size([0.0, 0.0, 0.05])
-            .with_pos([0.0, 0.0, low[2] - BELOW])
+            .with_pos([0.0, 0.0, height])
             .with_quat(quat::IDENTITY)
             .with_rgba([0.55, 0.58, 0.62, 1.0])
             .with_group(0);
     }
-    for (name, marks, opacity) in marked {
-        let body = spec
-            .body_mut(name)
-            .context("a body of the compiled scene")?;
-        add_marks(body, marks, opacity);
-    }
-    let mut furnished = compilation.finish(spec)?;
-    if has_no_camera {
-        let statistics = furnished.stat_mut();
-        statistics.center = [0, 1, 2].map(|axis| 0.5 * (low[axis] + high[axis]));
-        let squares: f64 = (0..3).map(|axis| (high[axis] - low[axis]).powi(2)).sum();
-        statistics.extent = squares.sqrt();
-    }
-    Ok(Some(furnished))
 }
 
 /// A coloured shape that shows how an object is turned: its kind, size, position and orientation.

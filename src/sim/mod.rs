@@ -20,6 +20,7 @@ mod placing;
 #[cfg(feature = "pictures")]
 mod renderer;
 mod scene;
+mod sharing;
 mod simulation;
 mod structure;
 mod symmetry;

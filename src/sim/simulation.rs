@@ -6,15 +6,12 @@ use anyhow::{Result, ensure};
 use mujoco_rs::prelude::{MjData, MjModel};
 
 use super::constants::*;
-use super::variation::Variation;
+use super::sharing::{Data, Variation, compute};
 use super::{Actuator, Body, Frame, FreeJoint, Mocap, Scene};
 use crate::quat::{self, Quat};
 
 /// MuJoCo's name for everything that the next step depends on.
 const EVERYTHING: u32 = mjSTATE_INTEGRATION as u32;
-
-/// What MuJoCo computes of one world.
-pub(super) type Data = MjData<Arc<MjModel>>;
 
 /// The state of one world. Body positions, velocities and joints always belong to the same instant.
 pub struct Simulation {
@@ -33,6 +30,11 @@ impl Simulation {
             nominal: scene.model.clone(),
             variation: None,
         }
+    }
+
+    /// Computes with the physics of this simulation.
+    pub(super) fn compute<T>(&mut self, act: impl FnOnce(&mut Data) -> T) -> T {
+        compute(&mut self.data, &self.nominal, self.variation.as_ref(), act)
     }
 
     /// Resets to the default state and clears warm start and warnings. Call [`Simulation::refresh`] after changing the state.

@@ -8,17 +8,13 @@
     reason = "two things that the wrapper does not let do; each comment says why it is sound"
 )]
 
-use std::cell::Cell;
-use std::mem;
-use std::ops::Range;
-use std::slice;
 use std::sync::Arc;
 
-use mujoco_rs::mujoco_c::{mj_copyModel, mj_setConst, mjOption, mjStatistic};
+use mujoco_rs::mujoco_c::{mj_copyModel, mj_setConst};
 use mujoco_rs::prelude::{MjData, MjModel};
 
 use super::placing::frames_within;
-use super::simulation::Data;
+use super::sharing::{Data, Varied};
 use super::{Actuator, Body, Hinge, Scene, Simulation};
 
 /// A change of the physics of a scene.
@@ -99,105 +95,6 @@ impl Scene {
     }
 }
 
-/// How the scene of one simulation differs from the scene that many share: only what differs is kept.
-pub(super) struct Variation {
-    /// Where the arrays of the two models differ, in bytes.
-    places: Vec<Range<usize>>,
-    /// What stands there, place after place.
-    bytes: Vec<u8>,
-    options: mjOption,
-    statistics: mjStatistic,
-}
-
-/// The model that the varied simulations of a thread take turns to use. A scene with meshes is large, so they have no models of
-/// their own.
-struct Varied {
-    shared: Arc<MjModel>,
-    /// It differs from the shared model in no other `places`.
-    model: MjModel,
-    places: Vec<Range<usize>>,
-}
-
-/// The numbers of bytes that are compared at once.
-const BLOCK: usize = 128;
-
-thread_local! {
-    static VARIED: Cell<Option<Varied>> = const { Cell::new(None) };
-}
-
-impl Varied {
-    /// The model of this thread for variations of a shared one.
-    fn take(shared: &Arc<MjModel>) -> Self {
-        let known = VARIED
-            .take()
-            .filter(|known| Arc::ptr_eq(&known.shared, shared));
-        known.unwrap_or_else(|| Self {
-            model: (**shared).clone(),
-            shared: shared.clone(),
-            places: Vec::new(),
-        })
-    }
-
-    /// The same place with the shared model but for a variation.
-    fn with(mut self, variation: &Variation) -> Self {
-        let model = arrays_mut(&mut self.model);
-        let shared = arrays(&self.shared);
-        for place in mem::take(&mut self.places) {
-            model[place.clone()].copy_from_slice(&shared[place]);
-        }
-        let mut bytes = &variation.bytes[..];
-        for place in &variation.places {
-            let (here, rest) = bytes.split_at(place.len());
-            model[place.clone()].copy_from_slice(here);
-            bytes = rest;
-        }
-        self.places.clone_from(&variation.places);
-        *self.model.opt_mut() = variation.options.clone();
-        *self.model.stat_mut() = variation.statistics.clone();
-        self
-    }
-
-    /// How the model differs from the shared one.
-    fn variation(&self) -> Variation {
-        let model = arrays(&self.model);
-        let mut places: Vec<Range<usize>> = Vec::new();
-        let blocks = arrays(&self.shared).chunks(BLOCK).zip(model.chunks(BLOCK));
-        for (i, (_, block)) in blocks.enumerate().filter(|(_, (a, b))| a != b) {
-            let start = i * BLOCK;
-            match places.last_mut().filter(|last| last.end == start) {
-                Some(last) => last.end += block.len(),
-                None => places.push(start..start + block.len()),
-            }
-        }
-        Variation {
-            bytes: places
-                .iter()
-                .flat_map(|place| &model[place.clone()])
-                .copied()
-                .collect(),
-            places,
-            options: self.model.opt().clone(),
-            statistics: self.model.stat().clone(),
-        }
-    }
-}
-
-/// The bytes of all arrays of a model.
-fn arrays(model: &MjModel) -> &[u8] {
-    let model = model.ffi();
-    // SAFETY: MuJoCo keeps all arrays of a model in one buffer of this size, which it fills when it makes the model.
-    unsafe { slice::from_raw_parts(model.buffer.cast(), model.nbuffer as usize) }
-}
-
-/// The same, to be overwritten by those of a model of the same structure.
-fn arrays_mut(model: &mut MjModel) -> &mut [u8] {
-    // SAFETY: as above; nothing else refers to the model meanwhile.
-    unsafe {
-        let model = model.ffi_mut();
-        slice::from_raw_parts_mut(model.buffer.cast(), model.nbuffer as usize)
-    }
-}
-
 impl Simulation {
     /// Continues in a scene with these changes. The state must be reset after it.
     ///
@@ -214,33 +111,7 @@ impl Simulation {
         // process if they differ. The data could not have taken a scene of another structure.
         unsafe { mj_copyModel(varied.model.ffi_mut(), scene.model.ffi()) };
         change(&mut varied.model, changes, &mut self.data);
-        let variation = varied.variation();
-        varied.places.clone_from(&variation.places);
-        self.variation = Some(variation);
-        VARIED.set(Some(varied));
-    }
-
-    /// Computes with the physics of this simulation.
-    pub(super) fn compute<T>(&mut self, act: impl FnOnce(&mut Data) -> T) -> T {
-        let Some(variation) = &self.variation else {
-            return act(&mut self.data);
-        };
-        let Varied {
-            shared,
-            model,
-            places,
-        } = Varied::take(&self.nominal).with(variation);
-        // SAFETY: the model has the structure of the one that it stands in for.
-        let resting = unsafe { self.data.swap_model_unchecked(Arc::new(model)) };
-        let result = act(&mut self.data);
-        // SAFETY: as above.
-        let model = unsafe { self.data.swap_model_unchecked(resting) };
-        VARIED.set(Arc::into_inner(model).map(|model| Varied {
-            shared,
-            model,
-            places,
-        }));
-        result
+        self.variation = Some(varied.leave());
     }
 }
 
@@ -256,6 +127,7 @@ fn change(model: &mut MjModel, changes: &[Change], data: &mut Data) {
 #[cfg(test)]
 mod tests {
     use super::super::compilation::BUILTIN;
+    use super::super::sharing::arrays;
     use super::super::{Compilation, Cone};
     use super::*;
 

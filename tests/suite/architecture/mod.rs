@@ -39,6 +39,7 @@ const UNSAFE: [&str; 8] = [
     "processor.rs",
     "sim/compilation.rs",
     "sim/fatal.rs",
+    "sim/sharing.rs",
     "sim/variation.rs",
 ];
 
