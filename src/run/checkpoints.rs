@@ -66,22 +66,6 @@ impl Checkpoints {
         Ok(())
     }
 
-    /// Writes the checkpoint that scored best.
-    ///
-    /// # Errors
-    /// Fails if the checkpoint cannot be written.
-    pub fn write_best(&self, bytes: &[u8]) -> Result<()> {
-        write_whole(&self.best(), bytes)
-    }
-
-    /// Sets a damaged best checkpoint aside, so that it is no longer used, and returns its new path.
-    ///
-    /// # Errors
-    /// Fails if the file cannot be renamed.
-    pub fn put_best_aside(&self) -> Result<PathBuf> {
-        put_aside(&self.best(), "damaged").cannot("rename", &self.best())
-    }
-
     /// All checkpoints that can be resumed from, the newest first. `latest` is a second name of one of the others, or a
     /// copy if the file system does not support hard links. It is older than the newest if the program ended just before updating
     /// it.

@@ -101,15 +101,8 @@ impl EventFile {
         let histograms = histograms
             .iter()
             .map(|(tag, histogram)| (*tag, Content::histo(histogram.clone())));
-        self.summary(numbers.chain(histograms), step)
-    }
-
-    fn summary<'a>(
-        &mut self,
-        values: impl Iterator<Item = (&'a str, Content)>,
-        step: u64,
-    ) -> Result<()> {
-        let values = values
+        let values = numbers
+            .chain(histograms)
             .map(|(tag, content)| value(tag, content, self.undescribed.remove(tag)))
             .collect();
         self.values(values, step)

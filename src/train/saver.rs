@@ -8,7 +8,7 @@ use anyhow::{Error, Result, anyhow};
 use crate::cli::TrainArgs;
 use crate::config::{Config, scene_option};
 use crate::load;
-use crate::os::{self, Locked, say};
+use crate::os::{self, Cannot, Locked, say};
 use crate::ppo::{Checkpoint, Fork, Progress};
 use crate::run::{Report, RunFolder};
 use crate::sim;
@@ -130,7 +130,7 @@ impl Saver {
         self.lock = lock.transpose()?;
         let best = self.held.folder.checkpoints.best();
         if load::read(&best).is_err_and(|error| load::is_damage(&error)) {
-            let aside = self.held.folder.checkpoints.put_best_aside()?;
+            let aside = os::put_aside(&best, "damaged").cannot("rename", &best)?;
             report.progress.warn(&format!(
                 "{} is damaged; renamed to {}",
                 best.display(),
@@ -358,7 +358,7 @@ fn write(
     match best {
         Some(best) => {
             os::write_whole(&folder.policy(), &best.policy_alone().to_bytes()?)?;
-            checkpoints.write_best(&best.to_bytes()?)?;
+            os::write_whole(&checkpoints.best(), &best.to_bytes()?)?;
         }
         None => keep_policy(folder, last)?,
     }
