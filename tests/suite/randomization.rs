@@ -683,7 +683,7 @@ fn what_cannot_be_varied_is_named() {
         ),
         (
             &["randomization.gains=[-1,1]"],
-            &["randomization.gains = [-1, 1]: must be [low, high] with 0 < low"],
+            &["randomization.gains = [-1.0, 1.0]: must be [low, high] with 0 < low"],
         ),
         (
             &["randomization.delay=[3,2]"],
