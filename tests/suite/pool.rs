@@ -82,8 +82,8 @@ fn play(
             .iter()
             .map(|n| vec![0.0; n * OBSERVATION_SIZE])
             .collect();
-        let rows = observations.iter_mut();
-        pool.reset(rows.flat_map(|rows| rows.chunks_exact_mut(OBSERVATION_SIZE)));
+        let blocks = observations.iter_mut();
+        pool.reset(blocks.flat_map(|rows| rows.chunks_exact_mut(OBSERVATION_SIZE)));
         let mut first = 0;
         let blocks = pool
             .blocks
@@ -216,8 +216,8 @@ fn a_pool_goes_on_from_its_saved_state_bit_for_bit_in_the_middle_of_episodes() {
             .map(|n| n * OBSERVATION_SIZE)
             .collect();
         let mut observations: Vec<Vec<f32>> = rows.iter().map(|&n| vec![0.0; n]).collect();
-        let rows = observations.iter_mut();
-        pool.reset(rows.flat_map(|rows| rows.chunks_exact_mut(OBSERVATION_SIZE)));
+        let blocks = observations.iter_mut();
+        pool.reset(blocks.flat_map(|rows| rows.chunks_exact_mut(OBSERVATION_SIZE)));
         let action = noise();
         let step = |pool: &mut EnvPool<Repose>, observations: &mut [Vec<f32>], step: usize| {
             let mut first = 0;

@@ -947,7 +947,7 @@ fn the_default_varies_nothing_before_its_ramp_begins() {
     ));
     for run in ["none", "fork"] {
         let share = config_of(&folder.join(run)).randomization.share;
-        assert!(share == Ramp::constant(0.0), "{run}: {share}");
+        assert!(share == Ramp::constant(0.0), "{run}: {share:?}");
         assert!(
             !metrics(&folder.join(run))[0]
                 .iter()
