@@ -225,7 +225,7 @@ impl Saver {
         self.own_folder(report)?;
         report.sync();
         self.describe()?;
-        self.held.write(&self.held.folder, self.held.keep)?;
+        self.held.write(&self.held.folder)?;
         self.held.best_is_saved = true;
         self.held.wrote = true;
         Ok(())
@@ -267,7 +267,7 @@ impl Saver {
                 .is_some_and(|holds| holds())
                 .then_some(())
                 .ok_or_else(replaced);
-            match ours.and_then(|()| held.write(&held.folder, held.keep)) {
+            match ours.and_then(|()| held.write(&held.folder)) {
                 Ok(()) => {
                     let iteration = held.last.progress.iteration;
                     let command = held.how_to_resume(&held.folder);
@@ -289,19 +289,19 @@ impl Held {
     }
 
     /// Writes the best policy, unless that is done, and the checkpoint into a run folder, in which the newest `keep` are kept.
-    fn write(&self, folder: &RunFolder, keep: usize) -> Result<()> {
+    fn write(&self, folder: &RunFolder) -> Result<()> {
         let unsaved = !self.best_is_saved || !folder.checkpoints.best().exists();
         write(
             folder,
             self.best.as_deref().filter(|_| unsaved),
             &self.last,
-            keep,
+            self.keep,
         )
     }
 
     /// Saves the state elsewhere after it could not be saved in its folder for this `reason`. Returns an error for both.
     pub fn elsewhere(&self, reason: Error) -> Error {
-        let saved = RunFolder::for_now().and_then(|run| match self.write(&run, 1) {
+        let saved = RunFolder::for_now().and_then(|run| match self.write(&run) {
             Ok(()) => Ok(run),
             Err(error) => {
                 run.remove();
