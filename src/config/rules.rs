@@ -147,7 +147,7 @@ fn env(config: &Config, rules: &mut Rules) {
     let is_path = (1..=LONGEST_PATH).contains(&model.len())
         && model.split('/').all(|name| name.len() <= LONGEST_NAME)
         && !model.contains(char::is_control);
-    rules.check(is_path, "env.model", "be a path or \"builtin\"");
+    rules.check_part(is_path, "env.model", model, "be a path or \"builtin\"");
     let ratio = env.ctrl_dt / env.sim_dt;
     let whole = (1.0..=1e4).contains(&ratio.round()) && (ratio / ratio.round() - 1.0).abs() < 1e-6;
     rules.check(
