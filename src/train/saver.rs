@@ -231,15 +231,6 @@ impl Saver {
         Ok(())
     }
 
-    /// Saves, and prints a warning if that is not possible now.
-    pub fn save_or_warn(&mut self, report: &mut Report) {
-        if let Err(error) = self.save(report) {
-            report.progress.warn(&format!(
-                "{error:#}; saving will be tried again at the next checkpoint"
-            ));
-        }
-    }
-
     /// Saves for the last time and ends the report. If the folder cannot be written to, the state is saved elsewhere. Before the
     /// first iteration of a resumed run there is nothing to save.
     ///
