@@ -327,14 +327,7 @@ impl State {
         ends: Vec<Option<End>>,
         size: usize,
     ) -> anyhow::Result<()> {
-        let mut rest = &mut self.observations[..];
-        let sizes = self.pool.block_sizes().into_iter();
-        let rows = sizes
-            .map(|block| {
-                rest.split_off_mut(..block * size)
-                    .expect("rows of each block")
-            })
-            .collect();
+        let rows = self.observations.chunks_exact_mut(size);
         self.pool.restore(saved, rows)?;
         let all = self.pool.members_mut().map(|member| &mut member.end);
         all.zip(ends).for_each(|(own, end)| *own = end);

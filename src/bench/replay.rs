@@ -20,6 +20,8 @@ struct Start {
     state: Box<[f64]>,
     /// What its episode has drawn.
     draw: Option<EpisodePhysics>,
+    /// Its scene, from the beginning of the replay on.
+    scene: Scene,
 }
 
 /// An environment that records the input of its physics and can replay it. This is the only difference from the environment of a
@@ -32,8 +34,6 @@ pub struct RecordingEnv {
     steps: Vec<(Vec<f64>, Option<[f64; 3]>)>,
     /// The physics alone.
     bare: Simulation,
-    /// The scenes of the `starts`.
-    scenes: Vec<Scene>,
     /// What the last episode in a replay has drawn, and its scene.
     drawn: (Option<EpisodePhysics>, Scene),
 }
@@ -48,7 +48,6 @@ impl RecordingEnv {
             starts: Vec::new(),
             steps: Vec::new(),
             bare: Simulation::new(nominal),
-            scenes: Vec::new(),
             drawn: (None, nominal.clone()),
         }
     }
@@ -65,19 +64,19 @@ impl RecordingEnv {
             after: self.steps.len(),
             state: self.env.sim.state(),
             draw: self.env.draw().cloned(),
+            scene: self.drawn.1.clone(),
         });
     }
 
     /// Prepares the scenes of a replay, and begins it.
     fn prepare(&mut self) {
-        self.scenes.clear();
-        for Start { draw, .. } in &self.starts {
+        for Start { draw, scene, .. } in &mut self.starts {
             if *draw != self.drawn.0 {
                 let randomization = self.randomization.as_ref().expect("it has drawn");
-                let (scene, changes) = randomization.scene_of(draw.as_ref(), &self.env.task.hand);
-                self.drawn = (draw.clone(), scene.varied(&changes));
+                let (base, changes) = randomization.scene_of(draw.as_ref(), &self.env.task.hand);
+                self.drawn = (draw.clone(), base.varied(&changes));
             }
-            self.scenes.push(self.drawn.1.clone());
+            scene.clone_from(&self.drawn.1);
         }
         self.go_on(0);
     }
@@ -94,10 +93,10 @@ impl RecordingEnv {
 
     /// Continues from the recorded state after this number of steps, if there is one.
     fn go_on(&mut self, steps: usize) {
-        if let Some(i) = self.starts.iter().position(|start| start.after == steps) {
-            self.bare.change_scene(&self.scenes[i], &[]);
+        if let Some(start) = self.starts.iter().find(|start| start.after == steps) {
+            self.bare.change_scene(&start.scene, &[]);
             self.bare
-                .restore(&self.starts[i].state)
+                .restore(&start.state)
                 .expect("a state of the same scene");
         }
     }

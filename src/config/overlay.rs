@@ -43,6 +43,14 @@ pub fn brief(x: f64) -> String {
     }
 }
 
+/// A value as it stands in an error message.
+pub fn shown(value: &Value) -> String {
+    match value {
+        Float(x) if x.is_finite() => brief(*x),
+        value => value.to_string(),
+    }
+}
+
 /// Whether a table of the base is a ramp, rather than a section or values by group.
 pub fn is_ramp(table: &Table) -> bool {
     table.contains_key("from")
@@ -147,14 +155,10 @@ pub fn overlay(
         match typed(expected, value) {
             Ok(value) => drop(merged.insert(key.clone(), value)),
             Err(rule) => {
-                let value = match value {
-                    Float(x) if x.is_finite() => brief(*x),
-                    value => value.to_string(),
-                };
                 problems.push(format!(
                     "{} = {}: must be {rule}",
                     shortened(&name),
-                    shortened(&value)
+                    shortened(&shown(value))
                 ));
             }
         }

@@ -1,7 +1,5 @@
 //! Settings that change in the course of a training run.
 
-use std::fmt;
-
 use serde::ser::SerializeStruct;
 use serde::{Deserialize, Serialize, Serializer};
 use toml::Value;
@@ -74,25 +72,6 @@ impl Serialize for Ramp {
     }
 }
 
-impl fmt::Display for Ramp {
-    fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
-        let Self {
-            from,
-            to,
-            steps,
-            after,
-        } = self;
-        if *self == Self::constant(*to) {
-            return to.fmt(f);
-        }
-        write!(f, "{{ from = {from}, to = {to}, steps = {steps}")?;
-        if *after > 0 {
-            write!(f, ", after = {after}")?;
-        }
-        f.write_str(" }")
-    }
-}
-
 /// A ramp that changes by the same factor in each step.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(transparent)]
@@ -157,8 +136,8 @@ mod tests {
             [5000, 4000, u64::MAX]
         );
         assert_eq!(
-            ramp.to_string(),
-            "{ from = 0, to = 0.5, steps = 1000, after = 4000 }"
+            Value::try_from(ramp).unwrap().to_string(),
+            "{ from = 0.0, to = 0.5, steps = 1000, after = 4000 }"
         );
     }
 

@@ -5,7 +5,7 @@ use std::fmt::Display;
 
 use toml::{Table, Value};
 
-use super::overlay::{brief, lookup, number, settings};
+use super::overlay::{brief, lookup, number, settings, shown};
 use super::settings::{Backend, Config, PpoConfig, Precision};
 use crate::os::shortened;
 
@@ -73,38 +73,41 @@ const LONGEST_NAME: usize = 255;
 
 /// Every rule that the values break, as "key = value: must …".
 pub fn violations(config: &Config) -> Vec<String> {
-    let mut rules = Rules::default();
     let table = Table::try_from(config).expect("a configuration is a tree of tables");
+    let mut rules = Rules {
+        table: &table,
+        broken: Vec::new(),
+    };
     for (keys, holds, rule) in RANGES {
         for key in keys.split_whitespace() {
-            rules.number(&table, key, holds, rule);
+            rules.number(key, holds, rule);
         }
     }
     for (key, most) in AT_MOST {
-        rules.number(&table, key, |x| x <= *most, format!("be at most {most}"));
+        rules.number(key, |x| x <= *most, format!("be at most {most}"));
     }
-    magnitudes(&table, &mut rules);
+    magnitudes(&mut rules);
     env(config, &mut rules);
-    hand(&table, &mut rules);
-    randomization(config, &table, &mut rules);
+    hand(&mut rules);
+    randomization(config, &mut rules);
     nets(config, &mut rules);
     samples(config, &mut rules);
     learning(&config.ppo, &mut rules);
-    rules.0
+    rules.broken
 }
 
-fn magnitudes(table: &Table, rules: &mut Rules) {
+fn magnitudes(rules: &mut Rules) {
     let limited = ["env.", "training.", "randomization."];
     // Much is computed from these values in `f32`.
     let [least, most] = [1e-37, 1e38];
-    for (key, value) in settings(table).filter(|(key, _)| key != "training.hold") {
+    for (key, value) in settings(rules.table).filter(|(key, _)| key != "training.hold") {
         let is_limited = limited.iter().any(|section| key.starts_with(section));
         let most = if is_limited { LARGEST } else { most };
         for x in floats(value) {
             let rule = format!("be at most {} in magnitude", brief(most));
-            rules.check(x.abs() <= most, &key, brief(x), rule);
+            rules.check_part(x.abs() <= most, &key, brief(x), rule);
             let rule = format!("be 0, or at least {least:e} in magnitude");
-            rules.check(x == 0.0 || x.abs() >= least, &key, brief(x), rule);
+            rules.check_part(x == 0.0 || x.abs() >= least, &key, brief(x), rule);
         }
     }
 }
@@ -119,8 +122,8 @@ fn floats(value: &Value) -> Vec<f64> {
     }
 }
 
-fn hand(table: &Table, rules: &mut Rules) {
-    for (key, value) in settings(table).filter(|(key, _)| key.starts_with("hand.")) {
+fn hand(rules: &mut Rules) {
+    for (key, value) in settings(rules.table).filter(|(key, _)| key.starts_with("hand.")) {
         let names = match value {
             Value::Array(names) => &names[..],
             // It names nothing.
@@ -130,28 +133,26 @@ fn hand(table: &Table, rules: &mut Rules) {
         for name in names.iter().filter_map(Value::as_str) {
             let fits = (1..=200).contains(&name.len()) && !name.contains(char::is_control);
             let rule = "hold names of 1 to 200 bytes without control characters";
-            rules.check(fits, &key, name, rule);
+            rules.check_part(fits, &key, name, rule);
         }
     }
 }
 
 fn env(config: &Config, rules: &mut Rules) {
     let env = &config.env;
-    let place = env.goal_position.value;
-    let near = place.iter().all(|x| x.abs() <= FARTHEST);
+    let near = env.goal_position.value.iter().all(|x| x.abs() <= FARTHEST);
     let rule = format!("have coordinates of at most {FARTHEST} m");
-    rules.check(near, "env.goal_position", format!("{place:?}"), rule);
+    rules.check(near, "env.goal_position", rule);
     let model = &env.model;
     let is_path = (1..=LONGEST_PATH).contains(&model.len())
         && model.split('/').all(|name| name.len() <= LONGEST_NAME)
         && !model.contains(char::is_control);
-    rules.check(is_path, "env.model", model, "be a path or \"builtin\"");
+    rules.check_part(is_path, "env.model", model, "be a path or \"builtin\"");
     let ratio = env.ctrl_dt / env.sim_dt;
     let whole = (1.0..=1e4).contains(&ratio.round()) && (ratio / ratio.round() - 1.0).abs() < 1e-6;
     rules.check(
         whole || ratio.is_nan() || ratio <= 0.0,
         "env.ctrl_dt",
-        env.ctrl_dt,
         format!(
             "be a whole multiple of env.sim_dt = {}, at most 10000 times it",
             env.sim_dt
@@ -161,14 +162,14 @@ fn env(config: &Config, rules: &mut Rules) {
     rules.check(
         (1.0..=1e9).contains(&steps),
         "env.max_episode_seconds",
-        env.max_episode_seconds,
         "last between one and 1e9 steps of env.ctrl_dt",
     );
 }
 
-fn randomization(config: &Config, table: &Table, rules: &mut Rules) {
+fn randomization(config: &Config, rules: &mut Rules) {
     let env = &config.env;
     // A factor that is drawn from a range also has a setting in [env].
+    let table = rules.table;
     for (key, value) in table["randomization"].as_table().into_iter().flatten() {
         let Some([Value::Float(low), Value::Float(high)]) = value.as_array().map(Vec::as_slice)
         else {
@@ -177,19 +178,16 @@ fn randomization(config: &Config, table: &Table, rules: &mut Rules) {
         rules.check(
             0.0 < *low && low <= high,
             &format!("randomization.{key}"),
-            format!("[{low}, {high}]"),
             "be [low, high] with 0 < low <= high",
         );
         let scale = format!("{key}_scale");
         let factor = table["env"][&scale].as_float().expect("a factor");
-        rules.check(factor > 0.0, &format!("env.{scale}"), factor, "be above 0");
+        rules.check(factor > 0.0, &format!("env.{scale}"), "be above 0");
     }
     let [low, high] = config.randomization.delay;
-    let range = format!("[{low}, {high}]");
     rules.check(
         low <= high,
         "randomization.delay",
-        &range,
         "be [low, high] with low <= high",
     );
     let steps = if env.max_episode_seconds >= env.ctrl_dt {
@@ -197,47 +195,33 @@ fn randomization(config: &Config, table: &Table, rules: &mut Rules) {
     } else {
         u32::MAX
     };
-    let rule = format!("be shorter than an episode, which lasts {steps} steps");
-    for (key, value) in [
-        ("env.action_delay", env.action_delay),
-        ("env.prediction", env.prediction),
+    let drawn = if high > 0 {
+        env.action_delay.saturating_add(high)
+    } else {
+        0
+    };
+    for (key, delay, with) in [
+        ("env.action_delay", env.action_delay, ""),
+        ("env.prediction", env.prediction, ""),
+        ("randomization.delay", drawn, ", with env.action_delay,"),
     ] {
-        rules.check(value < steps, key, value, &rule);
-        rules.check(
-            value <= LONGEST_DELAY,
-            key,
-            value,
-            format!("be at most {LONGEST_DELAY}"),
-        );
+        let rule = format!("be{with} shorter than an episode, which lasts {steps} steps");
+        rules.check(delay < steps, key, rule);
+        let rule = format!("be{with} at most {LONGEST_DELAY}");
+        rules.check(delay <= LONGEST_DELAY, key, rule);
     }
     rules.check(
         env.prediction == 0 || env.vel_obs_scale != 0.0,
         "env.vel_obs_scale",
-        env.vel_obs_scale,
         "not be 0 with env.prediction: velocities must be observed",
-    );
-    let longest = env.action_delay.saturating_add(high);
-    rules.check(
-        high == 0 || longest < steps,
-        "randomization.delay",
-        &range,
-        format!("be, with env.action_delay, shorter than an episode, which lasts {steps} steps"),
-    );
-    rules.check(
-        longest <= LONGEST_DELAY,
-        "randomization.delay",
-        range,
-        format!("be, with env.action_delay, at most {LONGEST_DELAY}"),
     );
 }
 
 fn nets(config: &Config, rules: &mut Rules) {
     let hidden = &config.ppo.hidden;
-    let sizes = format!("{:?}", &hidden[..hidden.len().min(65)]);
     rules.check(
         (1..=64).contains(&hidden.len()) && hidden.iter().all(|h| (1..=16384).contains(h)),
         "ppo.hidden",
-        &sizes,
         "hold one to 64 sizes from 1 to 16384",
     );
     let weights = hidden.array_windows().fold(0_usize, |sum, [a, b]| {
@@ -246,7 +230,6 @@ fn nets(config: &Config, rules: &mut Rules) {
     rules.check(
         weights <= 1 << 25,
         "ppo.hidden",
-        sizes,
         "have at most 2^25 weights between its layers",
     );
 }
@@ -259,14 +242,12 @@ fn samples(config: &Config, rules: &mut Rules) {
     rules.check(
         multiple,
         "ppo.horizon",
-        horizon,
         "be a whole number, or a ramp that ends at a multiple of its start",
     );
     let most = config.env.num_envs as f64 * horizon.to;
     rules.check(
         most <= (1 << 22).into(),
         "ppo.horizon",
-        horizon,
         "give at most 2^22 samples (num_envs * horizon)",
     );
     let samples = config.steps_per_iteration() as usize;
@@ -276,59 +257,63 @@ fn samples(config: &Config, rules: &mut Rules) {
     rules.check(
         divides,
         "ppo.minibatches",
-        parts,
         format!("divide num_envs * horizon = {samples}"),
     );
     let shards = config.run.shards;
     let dealt =
         !divides || parts == 0 || shards == 0 || shards.is_power_of_two() && config.divides(shards);
     let rule = "be 0, or a power of two that divides env.num_envs and the samples of a minibatch";
-    rules.check(dealt, "run.shards", shards, rule);
+    rules.check(dealt, "run.shards", rule);
 }
 
 fn learning(ppo: &PpoConfig, rules: &mut Rules) {
     rules.check(
         ppo.precision == Precision::F32 || ppo.backend == Backend::Fused,
         "ppo.precision",
-        Value::try_from(ppo.precision).expect("a string"),
         "be \"f32\" with ppo.backend = \"candle\"",
     );
     let [low, high] = ppo.learning_rate_range;
-    let range = format!("[{low}, {high}]");
     let kl = ppo.desired_kl.0;
     let fixed = [kl.from, kl.to].contains(&0.0);
     rules.check(
         !fixed || kl.from == kl.to,
         "ppo.desired_kl",
-        kl,
         "be above 0 at both ends, or 0 throughout",
     );
     let within = fixed || (low..=high).contains(&ppo.learning_rate);
-    let rule = format!("lie in ppo.learning_rate_range = {range} unless ppo.desired_kl = 0");
-    rules.check(within, "ppo.learning_rate", ppo.learning_rate, rule);
+    let rule =
+        format!("lie in ppo.learning_rate_range = [{low}, {high}] unless ppo.desired_kl = 0");
+    rules.check(within, "ppo.learning_rate", rule);
     rules.check(
         0.0 < low && low <= high,
         "ppo.learning_rate_range",
-        range,
         "be [low, high] with 0 < low <= high",
     );
     let [near, far] = ppo.away_range;
     rules.check(
         0.0 <= near && near < far,
         "ppo.away_range",
-        format!("[{near}, {far}]"),
         "be [near, far] with 0 <= near < far",
     );
 }
 
 /// The rules that were broken.
-#[derive(Default)]
-struct Rules(Vec<String>);
+struct Rules<'a> {
+    /// The settings.
+    table: &'a Table,
+    broken: Vec<String>,
+}
 
-impl Rules {
-    fn check(&mut self, holds: bool, key: &str, value: impl Display, rule: impl Display) {
+impl Rules<'_> {
+    fn check(&mut self, holds: bool, key: &str, rule: impl Display) {
+        let value = lookup(self.table, key).expect("a setting");
+        self.check_part(holds, key, shown(value), rule);
+    }
+
+    /// Checks part of a setting, which is shown alone.
+    fn check_part(&mut self, holds: bool, key: &str, value: impl Display, rule: impl Display) {
         if !holds {
-            self.0.push(format!(
+            self.broken.push(format!(
                 "{} = {}: must {rule}",
                 shortened(key),
                 shortened(&value.to_string())
@@ -337,20 +322,15 @@ impl Rules {
     }
 
     /// Checks a number, both ends of a ramp, or the numbers of all groups.
-    fn number(
-        &mut self,
-        table: &Table,
-        key: &str,
-        holds: impl Fn(f64) -> bool,
-        rule: impl Display,
-    ) {
+    fn number(&mut self, key: &str, holds: impl Fn(f64) -> bool, rule: impl Display) {
+        let setting = lookup(self.table, key).expect("a setting");
         let mut check = |name: &str, value: &Value| {
             let x = number(value).expect("a number");
-            self.check(holds(x), name, brief(x), &rule);
+            self.check_part(holds(x), name, brief(x), &rule);
         };
-        match lookup(table, key).expect("a setting") {
-            // The other parts of a ramp are counts of steps.
+        match setting {
             Value::Table(parts) => {
+                // The other parts of a ramp are counts of steps.
                 for (part, value) in parts.iter().filter(|(_, value)| value.is_float()) {
                     check(&format!("{key}.{part}"), value);
                 }

@@ -144,12 +144,10 @@ fn packed_rows(rows: &[Vec<f64>], counts: &[usize]) -> (Vec<f64>, Vec<u8>) {
 /// triangles.
 fn packed_mesh((corners, triangles): &Mesh) -> (Value, Vec<u8>) {
     let bounds = |pick: fn(f32, f32) -> f32, start| {
-        let along = |axis| {
-            corners
-                .iter()
-                .map(move |(point, _): &([f32; 3], _)| point[axis])
-        };
-        [0, 1, 2].map(|axis| along(axis).fold(start, pick))
+        [0, 1, 2].map(|axis| {
+            let along = corners.iter().map(|(point, _)| point[axis]);
+            along.fold(start, pick)
+        })
     };
     let low = bounds(f32::min, f32::INFINITY);
     let high = bounds(f32::max, f32::NEG_INFINITY);

@@ -120,21 +120,13 @@ impl<E: Env> EnvPool<E> {
             .collect()
     }
 
-    /// Starts the first episode of every environment, and writes the `observations` `[n, O]` of each block. Ages are
+    /// Starts the first episode of every environment, and writes its row `[O]` of the observations. Ages are
     /// random, so that the episodes do not all end together.
-    pub fn reset(&mut self, observations: Vec<&mut [f32]>) {
-        let size = self.spaces().observation_size;
-        self.blocks
-            .par_iter_mut()
-            .zip_eq(observations)
-            .for_each(|(block, rows)| {
-                let rows = rows.chunks_exact_mut(size);
-                block
-                    .members
-                    .iter_mut()
-                    .zip(rows)
-                    .for_each(|(member, row)| member.restart(true, row));
-            });
+    pub fn reset<'a>(&mut self, rows: impl Iterator<Item = &'a mut [f32]> + Send) {
+        self.members_mut()
+            .zip(rows)
+            .par_bridge()
+            .for_each(|(member, row)| member.restart(true, row));
     }
 
     /// Starts the next episode of each environment that is `marked`, at a random age if `aged`, and writes its row of the
@@ -142,13 +134,10 @@ impl<E: Env> EnvPool<E> {
     pub fn restart(&mut self, marked: &[bool], aged: bool, observations: &mut [f32]) {
         let rows = observations.chunks_exact_mut(self.spaces().observation_size);
         let members = self.members_mut().zip(rows).zip(marked);
-        let chosen: Vec<_> = members
+        members
             .filter(|(_, marked)| **marked)
-            .map(|(member, _)| member)
-            .collect();
-        chosen
-            .into_par_iter()
-            .for_each(|(member, row)| member.restart(aged, row));
+            .par_bridge()
+            .for_each(|((member, row), _)| member.restart(aged, row));
     }
 
     /// Steps every environment with its row of `actions` `[N, A]`. Writes `rewards` `[N]` and `observations` `[N, O]`, and to the
@@ -213,18 +202,18 @@ impl<E: Resumable> EnvPool<E> {
         state
     }
 
-    /// Resumes, bit for bit, from the states of all environments, and writes the `observations` `[n, O]` of each
-    /// block to act on next.
+    /// Resumes, bit for bit, from the states of all environments, and writes the observation `[O]` of each to act on
+    /// next.
     ///
     /// # Errors
     /// Fails if no such pool can have saved this state.
-    pub fn restore(&mut self, state: &EnvState, observations: Vec<&mut [f32]>) -> Result<()> {
-        let size = self.spaces().observation_size;
+    pub fn restore<'a>(
+        &mut self,
+        state: &EnvState,
+        rows: impl Iterator<Item = &'a mut [f32]>,
+    ) -> Result<()> {
         let first = &self.blocks[0].members[0];
         let states = state.rows(first.stride as usize)?.skip(first.number);
-        let rows = observations
-            .into_iter()
-            .flat_map(|rows| rows.chunks_exact_mut(size));
         for (member, (row, mut state)) in self.members_mut().zip(rows.zip(states)) {
             let number = member.number;
             let restore = || {

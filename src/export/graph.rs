@@ -1,6 +1,5 @@
 //! The graph of a policy: what `ppo::perception`, the normaliser and the actor compute, in operations of ONNX.
 
-use super::onnx::Attribute::{Float, Int};
 use super::onnx::Graph;
 use crate::config::Activation;
 use crate::ppo::{Perception, Policy};
@@ -63,15 +62,16 @@ fn actor(graph: &mut Graph, policy: &Policy, mut row: String) -> String {
             "Gemm",
             &[&row, &weight, &bias],
             &format!("layer{i}"),
-            &[("transB", Int(1))],
+            &[("transB", 1)],
         );
         if i + 1 < policy.layout.actor.len() {
-            let name = format!("hidden{i}");
-            row = match policy.activation {
-                Activation::Elu => graph.node("Elu", &[&row], &name, &[("alpha", Float(1.0))]),
-                Activation::Relu => graph.node("Relu", &[&row], &name, &[]),
-                Activation::Tanh => graph.node("Tanh", &[&row], &name, &[]),
+            let operation = match policy.activation {
+                // Its slope at zero, `alpha`, is 1 unless a node says otherwise.
+                Activation::Elu => "Elu",
+                Activation::Relu => "Relu",
+                Activation::Tanh => "Tanh",
             };
+            row = graph.node(operation, &[&row], &format!("hidden{i}"), &[]);
         }
     }
     row
@@ -113,20 +113,20 @@ fn canonicalize(
         "ArgMax",
         &["nearness"],
         "nearest",
-        &[("axis", Int(1)), ("keepdims", Int(0))],
+        &[("axis", 1), ("keepdims", 0)],
     );
     graph.node(
         "Gather",
         &["products", "nearest"],
         "product",
-        &[("axis", Int(0))],
+        &[("axis", 0)],
     );
     let [object, goal] = ["cube", "goal"].map(|quaternion| rotated(graph, quaternion));
     graph.node(
         "Concat",
         &["before", &object, "between", &goal, "after"],
         "seen",
-        &[("axis", Int(1))],
+        &[("axis", 1)],
     )
 }
 

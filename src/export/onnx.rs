@@ -10,11 +10,8 @@ const OPSET: i64 = 13;
 const FLOAT: i64 = 1;
 const INT64: i64 = 7;
 
-/// A number that belongs to an operation.
-pub enum Attribute {
-    Int(i64),
-    Float(f32),
-}
+/// The number of the type of an integer that belongs to an operation, `AttributeProto.AttributeType`.
+const INT: i64 = 2;
 
 /// Operations on named values, in the order in which they are computed.
 pub struct Graph(Message);
@@ -30,25 +27,21 @@ impl Graph {
         )
     }
 
-    /// Adds an operation and returns the name of its result.
+    /// Adds an operation with these integers as attributes, and returns the name of its result.
     pub fn node(
         &mut self,
         operation: &str,
         inputs: &[&str],
         output: &str,
-        attributes: &[(&str, Attribute)],
+        attributes: &[(&str, i64)],
     ) -> String {
         let node = inputs
             .iter()
             .fold(Message::default(), |node, input| node.text(1, input));
         let node = node.text(2, output).text(3, output).text(4, operation);
         let node = attributes.iter().fold(node, |node, (name, value)| {
-            let attribute = Message::default().text(1, name);
-            let attribute = match value {
-                Attribute::Float(value) => attribute.float(2, *value).int(20, 1),
-                Attribute::Int(value) => attribute.int(3, *value).int(20, 2),
-            };
-            node.message(5, &attribute)
+            let attribute = Message::default().text(1, name).int(3, *value);
+            node.message(5, &attribute.int(20, INT))
         });
         self.add(1, &node);
         output.to_owned()
@@ -118,10 +111,6 @@ struct Message(Vec<u8>);
 impl Message {
     fn int(self, field: u32, value: i64) -> Self {
         self.put(|out| out.write_int64(field, value))
-    }
-
-    fn float(self, field: u32, value: f32) -> Self {
-        self.put(|out| out.write_float(field, value))
     }
 
     fn text(self, field: u32, value: &str) -> Self {

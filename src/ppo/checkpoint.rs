@@ -183,19 +183,12 @@ impl Checkpoint {
         Ok(values)
     }
 
-    /// Removes the f32 arrays of these views, with `prefix` before their names, and returns their values in the order
-    /// of the views.
-    pub(super) fn take_floats(&mut self, prefix: &str, views: &[View]) -> Result<Vec<f32>> {
-        let mut all = Vec::new();
-        for View { name, shape, .. } in views {
-            let name = format!("{prefix}{name}");
-            self.expect(&name, shape)?;
-            let Array::F32(_, values) = self.take(&name)? else {
-                bail!("tensor `{name}` must be of type F32")
-            };
-            all.extend(values);
-        }
-        Ok(all)
+    fn take_floats(&mut self, name: &str, shape: &[usize]) -> Result<Vec<f32>> {
+        self.expect(name, shape)?;
+        let Array::F32(_, values) = self.take(name)? else {
+            bail!("tensor `{name}` must be of type F32")
+        };
+        Ok(values)
     }
 
     /// Checks that it contains the parameters of such nets, before the sizes in `config` determine an allocation.
@@ -232,14 +225,12 @@ impl Checkpoint {
         self.expect_policy(config, &spaces)?;
         let mut policy = Policy::new(config, spaces);
         policy.has_critic = self.has_critic();
-        let mut views = policy.layout.views();
-        views.retain(|view| policy.has_critic || !view.name.starts_with(CRITIC));
-        let read = self.take_floats("", &views)?;
-        policy.parameters[..read.len()].copy_from_slice(&read);
-        policy.log_std = match self.take(LOG_STD)? {
-            Array::F32(_, values) => values,
-            _ => bail!("tensor `{LOG_STD}` must be of type F32"),
-        };
+        for View { name, shape, range } in policy.layout.views() {
+            if policy.has_critic || !name.starts_with(CRITIC) {
+                policy.parameters[range].copy_from_slice(&self.take_floats(&name, &shape)?);
+            }
+        }
+        policy.log_std = self.take_floats(LOG_STD, &[spaces.action_size])?;
         let size = spaces.observation_size;
         let count = self.take_vector("normalizer.count", 1)?[0];
         let mean = self.take_vector("normalizer.mean", size)?;
@@ -360,10 +351,14 @@ impl Ppo {
     /// Fails for a policy alone, or if a tensor is missing, of another shape or type, or has impossible values.
     pub fn restore(&mut self, checkpoint: &mut Checkpoint) -> Result<()> {
         self.policy = checkpoint.take_policy(&self.config, self.policy.spaces)?;
-        let views = self.policy.layout.views();
-        self.adam.mean = checkpoint.take_floats("adam.mean.", &views)?;
-        self.adam.square = checkpoint.take_floats("adam.square.", &views)?;
-        for View { name, range, .. } in views {
+        for View { name, shape, range } in self.policy.layout.views() {
+            for (kind, moment) in [
+                ("mean", &mut self.adam.mean),
+                ("square", &mut self.adam.square),
+            ] {
+                let found = checkpoint.take_floats(&format!("adam.{kind}.{name}"), &shape)?;
+                moment[range.clone()].copy_from_slice(&found);
+            }
             ensure!(
                 self.adam.square[range].iter().all(|&x| x >= 0.0),
                 "tensor `adam.square.{name}` has a negative value"

@@ -102,7 +102,9 @@ impl GradientBackend for Fused {
         // The rows that pass through a net together: blocks of equal size as far as possible.
         let samples = groups.iter().map(|group| group.len()).max().unwrap_or(0);
         let rows = samples.div_ceil(samples.div_ceil(ROWS));
-        let [actor, critic] = &policy.nets(self.arithmetic, true);
+        let mut nets = policy.nets();
+        Net::prepare(&mut nets, self.arithmetic, true);
+        let [actor, critic] = &nets;
         let loss = Loss::new(policy, rollout, count, config);
         let [of_actor, _] = policy.layout.nets();
         gradients.resize_with(groups.len(), || vec![0.0; policy.layout.count()]);

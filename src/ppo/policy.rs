@@ -112,18 +112,11 @@ impl Policy {
         Perception::new(&self.spaces, &self.normalizer)
     }
 
-    /// Actor and critic.
-    fn plain_nets(&self) -> [Net<'_>; 2] {
+    /// Actor and critic, not prepared.
+    pub(super) fn nets(&self) -> [Net<'_>; 2] {
         let layout = &self.layout;
         [&layout.actor, &layout.critic]
             .map(|layers| Net::new(layers, &self.parameters, self.activation))
-    }
-
-    /// Actor and critic, prepared for workspaces of this arithmetic, to learn or to act.
-    pub(super) fn nets(&self, arithmetic: Arithmetic, learns: bool) -> [Net<'_>; 2] {
-        let mut nets = self.plain_nets();
-        Net::prepare(&mut nets, arithmetic, learns);
-        nets
     }
 
     /// The policy in its current state.
@@ -135,17 +128,16 @@ impl Policy {
     pub fn freeze_briefly(&self) -> FrozenPolicy<'_> {
         FrozenPolicy {
             policy: self,
-            nets: self.plain_nets(),
+            nets: self.nets(),
             perception: self.perception(),
         }
     }
 
     /// The policy in its current state, prepared for workspaces of this arithmetic.
     pub(super) fn freeze_for(&self, arithmetic: Arithmetic) -> FrozenPolicy<'_> {
-        FrozenPolicy {
-            nets: self.nets(arithmetic, false),
-            ..self.freeze_briefly()
-        }
+        let mut frozen = self.freeze_briefly();
+        Net::prepare(&mut frozen.nets, arithmetic, false);
+        frozen
     }
 
     /// The mean actions `[B, A]` for raw observations `[B, O]`. The results for a row are bit for bit the same whatever the other

@@ -96,7 +96,6 @@ impl Rollout {
         let mut resized = Self::new(horizon, &sizes, spaces);
         for (new, old) in resized
             .first_observations_mut()
-            .into_iter()
             .zip(self.first_observations_mut())
         {
             new.copy_from_slice(old);
@@ -112,12 +111,12 @@ impl Rollout {
         }
     }
 
-    /// The observations `[n, O]` of each block that the first step acts on.
-    pub fn first_observations_mut(&mut self) -> Vec<&mut [f32]> {
-        self.blocks
-            .iter_mut()
-            .map(RolloutBlock::first_observations_mut)
-            .collect()
+    /// The observation `[O]` of each environment that the first step acts on.
+    pub fn first_observations_mut(&mut self) -> impl Iterator<Item = &mut [f32]> {
+        self.blocks.iter_mut().flat_map(|block| {
+            let rows = block.observations.chunks_exact_mut(block.observation_size);
+            rows.take(block.envs)
+        })
     }
 }
 
@@ -135,11 +134,6 @@ impl RolloutBlock {
     /// The range of a sample in an array `[T, n, width]`.
     pub fn row(width: usize, sample: usize) -> Range<usize> {
         sample * width..(sample + 1) * width
-    }
-
-    /// The observations `[n, O]` that the first step acts on.
-    pub fn first_observations_mut(&mut self) -> &mut [f32] {
-        &mut self.observations[..self.envs * self.observation_size]
     }
 
     /// The range of step `t` in an array `[T, n, width]`.
@@ -165,9 +159,9 @@ mod tests {
         let mut rollout = Rollout::new(2, &[3], &SPACES);
         let after_the_last = rollout.blocks[0].step(2, 4);
         rollout.blocks[0].observations[after_the_last].fill(7.0);
-        assert_eq!(rollout.first_observations_mut(), [[0.0; 12]]);
+        assert!(rollout.first_observations_mut().eq([[0.0; 4]; 3]));
         rollout.carry_over();
-        assert_eq!(rollout.first_observations_mut(), [[7.0; 12]]);
+        assert!(rollout.first_observations_mut().eq([[7.0; 4]; 3]));
         let block = &rollout.blocks[0];
         assert_eq!(block.observations[block.step(0, 4)], [7.0; 12]);
     }

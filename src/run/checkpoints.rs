@@ -2,6 +2,7 @@
 //! the newest.
 
 use std::fs;
+use std::io;
 use std::path::{Path, PathBuf};
 use std::time::SystemTime;
 
@@ -66,22 +67,6 @@ impl Checkpoints {
         Ok(())
     }
 
-    /// Writes the checkpoint that scored best.
-    ///
-    /// # Errors
-    /// Fails if the checkpoint cannot be written.
-    pub fn write_best(&self, bytes: &[u8]) -> Result<()> {
-        write_whole(&self.best(), bytes)
-    }
-
-    /// Sets a damaged best checkpoint aside, so that it is no longer used, and returns its new path.
-    ///
-    /// # Errors
-    /// Fails if the file cannot be renamed.
-    pub fn put_best_aside(&self) -> Result<PathBuf> {
-        put_aside(&self.best(), "damaged").cannot("rename", &self.best())
-    }
-
     /// All checkpoints that can be resumed from, the newest first. `latest` is a second name of one of the others, or a
     /// copy if the file system does not support hard links. It is older than the newest if the program ended just before updating
     /// it.
@@ -104,22 +89,11 @@ impl Checkpoints {
 
     /// The checkpoints named after iterations, the newest first.
     fn numbered(&self) -> Vec<(u64, PathBuf)> {
-        let entries = fs::read_dir(&self.folder.path)
-            .into_iter()
-            .flatten()
-            .flatten();
-        let numbered = entries.filter_map(|entry| {
-            let name = entry.file_name();
-            let number = name
-                .to_str()?
-                .strip_prefix("iteration-")?
-                .strip_suffix(".safetensors")?
-                .parse()
-                .ok()?;
-            let is_file = entry.file_type().is_ok_and(|kind| kind.is_file());
-            is_file.then(|| (number, entry.path()))
-        });
-        let mut numbered: Vec<_> = numbered.collect();
+        let iteration = |name: &str| {
+            let digits = name.strip_prefix("iteration-")?;
+            digits.strip_suffix(".safetensors")?.parse().ok()
+        };
+        let mut numbered = numbered_files(&self.folder.path, iteration).unwrap_or_default();
         numbered.sort_unstable_by(|a, b| b.cmp(a));
         numbered
     }
@@ -141,6 +115,22 @@ pub fn expect_no_link(path: &Path) -> Result<()> {
         shown(path).display()
     );
     Ok(())
+}
+
+/// The files of `folder` whose names contain a number, as `number` reads it.
+///
+/// # Errors
+/// Fails if the folder cannot be read.
+pub fn numbered_files(
+    folder: &Path,
+    number: impl Fn(&str) -> Option<u64>,
+) -> io::Result<Vec<(u64, PathBuf)>> {
+    let numbered = fs::read_dir(folder)?.flatten().filter_map(|entry| {
+        let number = number(entry.file_name().to_str()?)?;
+        let is_file = entry.file_type().is_ok_and(|kind| kind.is_file());
+        is_file.then(|| (number, entry.path()))
+    });
+    Ok(numbered.collect())
 }
 
 /// The time when a file was written, if it is there.

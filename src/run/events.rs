@@ -13,6 +13,7 @@ use tensorboard_proto::event::{
 use tensorboard_proto::summary::{Summary, Summary_Value, Summary_Value_oneof_value as Content};
 use tensorboard_rs::record_writer::RecordWriter;
 
+use super::checkpoints::numbered_files;
 use super::histogram::Histogram;
 use super::layout::layout;
 use super::records::length_up_to;
@@ -101,15 +102,8 @@ impl EventFile {
         let histograms = histograms
             .iter()
             .map(|(tag, histogram)| (*tag, Content::histo(histogram.clone())));
-        self.summary(numbers.chain(histograms), step)
-    }
-
-    fn summary<'a>(
-        &mut self,
-        values: impl Iterator<Item = (&'a str, Content)>,
-        step: u64,
-    ) -> Result<()> {
-        let values = values
+        let values = numbers
+            .chain(histograms)
             .map(|(tag, content)| value(tag, content, self.undescribed.remove(tag)))
             .collect();
         self.values(values, step)
@@ -180,20 +174,14 @@ pub fn cut_off_after(folder: &Path, last_step: u64) -> Result<()> {
 /// This program's event files in `folder`, each with the seconds in its name.
 pub fn event_files(folder: &Path) -> Result<Vec<(u64, PathBuf)>> {
     let [begin, end] = NAME;
-    let entries = fs::read_dir(folder).cannot("read", folder)?;
-    let ours = entries.flatten().filter_map(|entry| {
-        let name = entry.file_name();
-        let (seconds, _) = name
-            .to_str()?
-            .strip_prefix(begin)?
-            .strip_suffix(end)?
-            .split_once('.')?;
+    let begun = |name: &str| {
+        let rest = name.strip_prefix(begin)?.strip_suffix(end)?;
+        let (seconds, _) = rest.split_once('.')?;
         let seconds: u64 = seconds.parse().ok()?;
         // Bounded, so that adding to it cannot overflow.
-        let is_ours = seconds < 1 << 40 && entry.file_type().is_ok_and(|kind| kind.is_file());
-        is_ours.then(|| (seconds, entry.path()))
-    });
-    Ok(ours.collect())
+        (seconds < 1 << 40).then_some(seconds)
+    };
+    numbered_files(folder, begun).cannot("read", folder)
 }
 
 /// The seconds since 1970.

@@ -3,13 +3,18 @@
 //!
 //! The row has a folder of its own, `hparams` in the folder of the run, because TensorBoard takes all scalars beside it for its
 //! metrics. No experiment is written, which would name the columns of all rows: no run knows the others, and TensorBoard finds them
-//! by itself. The messages are defined in TensorBoard's `plugins/hparams/plugin_data.proto`, which tensorboard-proto does not know.
+//! by itself.
 
 use std::fs;
 use std::path::Path;
 
 use anyhow::Result;
-use protobuf::{CodedOutputStream, ProtobufResult};
+use protobuf::Message;
+use protobuf::well_known_types::Value as Parameter;
+use tensorboard_proto::api::Status;
+use tensorboard_proto::plugin_hparams::{
+    HParamsPluginData, HParamsPluginData_oneof_data as Data, SessionEndInfo, SessionStartInfo,
+};
 use tensorboard_proto::summary::{Summary_Value, Summary_Value_oneof_value as Content};
 use tensorboard_proto::tensor::TensorProto;
 use tensorboard_proto::types::DataType;
@@ -38,55 +43,60 @@ pub fn begin(folder: &Path, step: u64, settings: &Table) -> Result<EventFile> {
         fs::remove_file(&old).cannot("remove", &old)?;
     }
     let events = EventFile::create(&folder, step, &Descriptions::new(), "")?;
-    events.values(
-        vec![session_value(
-            "session_start_info",
-            3,
-            &start_info(settings)?,
-        )?],
-        step,
+    let start = session_value(
+        "session_start_info",
+        Data::session_start_info(start_info(settings)),
     )?;
+    events.values(vec![start], step)?;
     Ok(events)
 }
 
 /// The end of the row: whether the training run has made all its steps, or failed.
 pub fn end(succeeded: bool) -> Result<Vec<Summary_Value>> {
-    let status = if succeeded { 1 } else { 2 };
-    let info = message(|out| {
-        out.write_enum(1, status)?;
-        out.write_double(2, now())
-    })?;
-    Ok(vec![session_value("session_end_info", 4, &info)?])
+    let info = SessionEndInfo {
+        status: if succeeded {
+            Status::STATUS_SUCCESS
+        } else {
+            Status::STATUS_FAILURE
+        },
+        end_time_secs: now(),
+        ..SessionEndInfo::default()
+    };
+    Ok(vec![session_value(
+        "session_end_info",
+        Data::session_end_info(info),
+    )?])
 }
 
-/// The message `SessionStartInfo`.
-fn start_info(settings: &Table) -> ProtobufResult<Vec<u8>> {
-    message(|out| {
-        for (key, value) in settings {
-            out.write_bytes(1, &entry(key, value)?)?;
-        }
-        out.write_double(5, now())
-    })
+fn start_info(settings: &Table) -> SessionStartInfo {
+    SessionStartInfo {
+        hparams: settings
+            .iter()
+            .map(|(key, value)| (key.clone(), parameter(value)))
+            .collect(),
+        start_time_secs: now(),
+        ..SessionStartInfo::default()
+    }
 }
 
-/// An entry of the map of settings: a key, and a `google.protobuf.Value`.
-fn entry(key: &str, value: &Value) -> ProtobufResult<Vec<u8>> {
-    let value = message(|out| match value {
-        Value::Integer(x) => out.write_double(2, *x as f64),
-        Value::Float(x) => out.write_double(2, *x),
-        Value::Boolean(x) => out.write_bool(4, *x),
-        Value::String(text) => out.write_string(3, text),
-        other => out.write_string(3, &other.to_string()),
-    })?;
-    message(|out| {
-        out.write_string(1, key)?;
-        out.write_bytes(2, &value)
-    })
+fn parameter(value: &Value) -> Parameter {
+    let mut parameter = Parameter::new();
+    match value {
+        Value::Integer(x) => parameter.set_number_value(*x as f64),
+        Value::Float(x) => parameter.set_number_value(*x),
+        Value::Boolean(x) => parameter.set_bool_value(*x),
+        Value::String(text) => parameter.set_string_value(text.clone()),
+        other => parameter.set_string_value(other.to_string()),
+    }
+    parameter
 }
 
-/// The value that holds a message of the plugin, which is this field of `HParamsPluginData`.
-fn session_value(name: &str, field: u32, info: &[u8]) -> Result<Summary_Value> {
-    let content = message(|out| out.write_bytes(field, info))?;
+/// The value that holds a message of the plugin.
+fn session_value(name: &str, data: Data) -> Result<Summary_Value> {
+    let plugin = HParamsPluginData {
+        data: Some(data),
+        ..HParamsPluginData::default()
+    };
     // The value itself is empty: a list of no numbers.
     let mut nothing = TensorProto {
         dtype: DataType::DT_FLOAT,
@@ -100,19 +110,11 @@ fn session_value(name: &str, field: u32, info: &[u8]) -> Result<Summary_Value> {
         // A tensor (`DataClass` in TensorBoard's summary.proto).
         2,
     );
-    value.mut_metadata().mut_plugin_data().set_content(content);
+    value
+        .mut_metadata()
+        .mut_plugin_data()
+        .set_content(plugin.write_to_bytes()?);
     Ok(value)
-}
-
-fn message(
-    write: impl FnOnce(&mut CodedOutputStream) -> ProtobufResult<()>,
-) -> ProtobufResult<Vec<u8>> {
-    let mut bytes = Vec::new();
-    let mut out = CodedOutputStream::vec(&mut bytes);
-    write(&mut out)?;
-    out.flush()?;
-    drop(out);
-    Ok(bytes)
 }
 
 #[cfg(test)]
@@ -154,15 +156,15 @@ mod tests {
             "a = 3\nb = 0.5\nc = true\nd = 'tanh'\ne = [1, 2]\nf = {from = 1, to = 2, steps = 3}",
         )
         .unwrap();
-        let value =
-            session_value("session_start_info", 3, &start_info(&settings).unwrap()).unwrap();
+        let start = Data::session_start_info(start_info(&settings));
+        let value = session_value("session_start_info", start).unwrap();
         let (field, info) = content(&value);
         assert_eq!(
             (value.get_tag(), field),
             ("_hparams_/session_start_info", 3)
         );
         let entries = fields(&info).into_iter().filter(|(field, _)| *field == 1);
-        let entries: Vec<_> = entries
+        let mut entries: Vec<_> = entries
             .map(|(_, entry)| {
                 let [(1, key), (2, value)] = &fields(&entry)[..] else {
                     panic!("{entry:?}")
@@ -177,6 +179,7 @@ mod tests {
                 format!("{} {shown}", String::from_utf8(key.clone()).unwrap())
             })
             .collect();
+        entries.sort();
         let expected = "a 3; b 0.5; c true; d tanh; e [1, 2]; f { from = 1, to = 2, steps = 3 }";
         assert_eq!(entries.join("; "), expected);
     }

@@ -61,8 +61,9 @@ impl Comparison {
     /// The lines that follow the table of both runs.
     pub fn lines(&self) -> Vec<String> {
         let of_user = self.settings.as_ref().map(|all| {
-            let of_user = all.iter().filter(|(key, _)| !is_derived(key));
-            Vec::from_iter(of_user)
+            let mut all = all.clone();
+            all.retain(|(key, _)| !is_derived(key));
+            all
         });
         let settings = match of_user.as_deref() {
             None => vec![vec!["the settings of one run are not known".into()]],
@@ -151,10 +152,10 @@ fn marks([a, b]: &[Curves; 2]) -> Vec<f64> {
 
 /// The mean of the values after `begin` up to `end`, or NaN if there are none.
 fn mean_between(points: &[[f64; 2]], begin: f64, end: f64) -> f64 {
-    let inside = points
+    let inside: Vec<f64> = points
         .iter()
         .filter(|[step, _]| *step > begin && *step <= end)
-        .map(|[_, value]| *value);
-    let (sum, count) = inside.fold((0.0, 0.0), |(sum, count), value| (sum + value, count + 1.0));
-    sum / count
+        .map(|[_, value]| *value)
+        .collect();
+    inside.iter().sum::<f64>() / inside.len() as f64
 }

@@ -264,7 +264,11 @@ impl Duties for Lead {
     }
 
     fn save(&mut self) {
-        self.saver.save_or_warn(&mut self.report);
+        if let Err(error) = self.saver.save(&mut self.report) {
+            self.report.progress.warn(&format!(
+                "{error:#}; saving will be tried again at the next checkpoint"
+            ));
+        }
     }
 }
 

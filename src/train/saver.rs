@@ -8,7 +8,7 @@ use anyhow::{Error, Result, anyhow};
 use crate::cli::TrainArgs;
 use crate::config::{Config, scene_option};
 use crate::load;
-use crate::os::{self, Locked, say};
+use crate::os::{self, Cannot, Locked, say};
 use crate::ppo::{Checkpoint, Fork, Progress};
 use crate::run::{Report, RunFolder};
 use crate::sim;
@@ -130,7 +130,7 @@ impl Saver {
         self.lock = lock.transpose()?;
         let best = self.held.folder.checkpoints.best();
         if load::read(&best).is_err_and(|error| load::is_damage(&error)) {
-            let aside = self.held.folder.checkpoints.put_best_aside()?;
+            let aside = os::put_aside(&best, "damaged").cannot("rename", &best)?;
             report.progress.warn(&format!(
                 "{} is damaged; renamed to {}",
                 best.display(),
@@ -225,19 +225,10 @@ impl Saver {
         self.own_folder(report)?;
         report.sync();
         self.describe()?;
-        self.held.write(&self.held.folder, self.held.keep)?;
+        self.held.write(&self.held.folder)?;
         self.held.best_is_saved = true;
         self.held.wrote = true;
         Ok(())
-    }
-
-    /// Saves, and prints a warning if that is not possible now.
-    pub fn save_or_warn(&mut self, report: &mut Report) {
-        if let Err(error) = self.save(report) {
-            report.progress.warn(&format!(
-                "{error:#}; saving will be tried again at the next checkpoint"
-            ));
-        }
     }
 
     /// Saves for the last time and ends the report. If the folder cannot be written to, the state is saved elsewhere. Before the
@@ -267,7 +258,7 @@ impl Saver {
                 .is_some_and(|holds| holds())
                 .then_some(())
                 .ok_or_else(replaced);
-            match ours.and_then(|()| held.write(&held.folder, held.keep)) {
+            match ours.and_then(|()| held.write(&held.folder)) {
                 Ok(()) => {
                     let iteration = held.last.progress.iteration;
                     let command = held.how_to_resume(&held.folder);
@@ -289,19 +280,19 @@ impl Held {
     }
 
     /// Writes the best policy, unless that is done, and the checkpoint into a run folder, in which the newest `keep` are kept.
-    fn write(&self, folder: &RunFolder, keep: usize) -> Result<()> {
+    fn write(&self, folder: &RunFolder) -> Result<()> {
         let unsaved = !self.best_is_saved || !folder.checkpoints.best().exists();
         write(
             folder,
             self.best.as_deref().filter(|_| unsaved),
             &self.last,
-            keep,
+            self.keep,
         )
     }
 
     /// Saves the state elsewhere after it could not be saved in its folder for this `reason`. Returns an error for both.
     pub fn elsewhere(&self, reason: Error) -> Error {
-        let saved = RunFolder::for_now().and_then(|run| match self.write(&run, 1) {
+        let saved = RunFolder::for_now().and_then(|run| match self.write(&run) {
             Ok(()) => Ok(run),
             Err(error) => {
                 run.remove();
@@ -358,7 +349,7 @@ fn write(
     match best {
         Some(best) => {
             os::write_whole(&folder.policy(), &best.policy_alone().to_bytes()?)?;
-            checkpoints.write_best(&best.to_bytes()?)?;
+            os::write_whole(&checkpoints.best(), &best.to_bytes()?)?;
         }
         None => keep_policy(folder, last)?,
     }

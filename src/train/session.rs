@@ -72,14 +72,21 @@ impl Session {
 
     /// Sets up what is planned, on all ranks together.
     fn set_up(mut plan: Plan, exchange: &Exchange) -> Result<Self> {
-        let loaded = plan.load_task()?;
         let exchange = exchange.clone().over(plan.config.shards())?;
-        if exchange.is_first() {
-            plan.send(&exchange)?;
-        }
         let threads = plan.config.run.threads;
         os::start_threads(threads)?;
-        let session = Self::new(plan, loaded, exchange)?;
+        let context = plan.context.clone();
+        let set_up = || {
+            let loaded = plan.load_task()?;
+            if exchange.is_first() {
+                plan.send(&exchange)?;
+            }
+            Self::new(plan, loaded, exchange)
+        };
+        let session = match context {
+            Some(context) => set_up().context(context),
+            None => set_up(),
+        }?;
         let exchange = &session.agent.exchange;
         if let Some(warning) = exchange.expect_alike(&session.scene)?
             && exchange.is_first()
@@ -99,33 +106,26 @@ impl Session {
             mut config,
             from,
             best,
-            context,
             dumps,
             ..
         } = plan;
-        let set_up = || {
-            // As it is saved.
-            config.run.shards = config.shards();
-            let agent = Agent::for_task(&task, &config, exchange)?;
-            let mut session = Self {
-                scene: task.scene.fingerprint(),
-                hand,
-                config,
-                task,
-                agent,
-                best,
-                rise: None,
-                dumps,
-            };
-            if let Some((takes, checkpoint)) = from {
-                session.start(takes, checkpoint)?;
-            }
-            Ok(session)
+        // As it is saved.
+        config.run.shards = config.shards();
+        let agent = Agent::for_task(&task, &config, exchange)?;
+        let mut session = Self {
+            scene: task.scene.fingerprint(),
+            hand,
+            config,
+            task,
+            agent,
+            best,
+            rise: None,
+            dumps,
         };
-        match context {
-            Some(context) => set_up().context(context),
-            None => set_up(),
+        if let Some((takes, checkpoint)) = from {
+            session.start(takes, checkpoint)?;
         }
+        Ok(session)
     }
 
     /// Starts from the policy or the state in a checkpoint.

@@ -218,23 +218,16 @@ impl Plan {
     /// # Errors
     /// Fails if the scene cannot be used, or if the policy is for another hand.
     pub fn load_task(&mut self) -> Result<(Arc<Task>, Record)> {
-        let load = || -> Result<_> {
-            let config = &self.config;
-            let task = Task::new(config)?;
-            let record = match &self.from {
-                Some((_, checkpoint)) => Record::parse(&checkpoint.hand)?,
-                None => task.record().with(config.ppo.symmetry),
-            };
-            // What is written must be readable.
-            Record::parse(&record.to_text())?;
-            Ok((task.for_policy(&record)?, record))
+        let task = Task::new(&self.config)?;
+        let record = match &self.from {
+            Some((_, checkpoint)) => Record::parse(&checkpoint.hand)?,
+            None => task.record().with(self.config.ppo.symmetry),
         };
-        let loaded = match &self.context {
-            Some(context) => load().context(context.clone()),
-            None => load(),
-        }?;
-        self.config.env = loaded.0.config.clone();
-        Ok(loaded)
+        // What is written must be readable.
+        Record::parse(&record.to_text())?;
+        let task = task.for_policy(&record)?;
+        self.config.env = task.config.clone();
+        Ok((task, record))
     }
 
     /// Sends the plan to the others, if there are any.

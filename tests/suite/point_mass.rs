@@ -386,7 +386,7 @@ fn a_panic_in_an_environment_is_an_error_with_its_number_on_any_number_of_thread
 fn truncation_and_another_goal_bootstrap_from_the_final_observation_and_termination_does_not() {
     let mut agent = agent(&settings(), 1);
     // One point starts so far out that its episode terminates at once.
-    agent.rollout.blocks[0].first_observations_mut()[..2].copy_from_slice(&[5.0, 5.0]);
+    agent.rollout.blocks[0].observations[..2].copy_from_slice(&[5.0, 5.0]);
     agent.pool.envs_mut().next().unwrap().position = [5.0, 5.0];
     agent
         .pool

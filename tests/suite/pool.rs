@@ -82,7 +82,8 @@ fn play(
             .iter()
             .map(|n| vec![0.0; n * OBSERVATION_SIZE])
             .collect();
-        pool.reset(observations.iter_mut().map(|rows| &mut rows[..]).collect());
+        let blocks = observations.iter_mut();
+        pool.reset(blocks.flat_map(|rows| rows.chunks_exact_mut(OBSERVATION_SIZE)));
         let mut first = 0;
         let blocks = pool
             .blocks
@@ -215,7 +216,8 @@ fn a_pool_goes_on_from_its_saved_state_bit_for_bit_in_the_middle_of_episodes() {
             .map(|n| n * OBSERVATION_SIZE)
             .collect();
         let mut observations: Vec<Vec<f32>> = rows.iter().map(|&n| vec![0.0; n]).collect();
-        pool.reset(observations.iter_mut().map(|rows| &mut rows[..]).collect());
+        let blocks = observations.iter_mut();
+        pool.reset(blocks.flat_map(|rows| rows.chunks_exact_mut(OBSERVATION_SIZE)));
         let action = noise();
         let step = |pool: &mut EnvPool<Repose>, observations: &mut [Vec<f32>], step: usize| {
             let mut first = 0;
@@ -238,7 +240,9 @@ fn a_pool_goes_on_from_its_saved_state_bit_for_bit_in_the_middle_of_episodes() {
         again
             .restore(
                 &state,
-                restored.iter_mut().map(|rows| &mut rows[..]).collect(),
+                restored
+                    .iter_mut()
+                    .flat_map(|rows| rows.chunks_exact_mut(OBSERVATION_SIZE)),
             )
             .unwrap();
         assert!(restored == observations, "the observations to act on");
@@ -254,7 +258,8 @@ fn a_pool_goes_on_from_its_saved_state_bit_for_bit_in_the_middle_of_episodes() {
             ended.len()
         );
         let other = new_pool(23).save();
-        let rows = restored.iter_mut().map(|rows| &mut rows[..]).collect();
+        let rows = restored.iter_mut();
+        let rows = rows.flat_map(|rows| rows.chunks_exact_mut(OBSERVATION_SIZE));
         assert!(
             again.restore(&other, rows).is_err(),
             "the state of fewer environments must be refused"

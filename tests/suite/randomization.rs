@@ -683,7 +683,7 @@ fn what_cannot_be_varied_is_named() {
         ),
         (
             &["randomization.gains=[-1,1]"],
-            &["randomization.gains = [-1, 1]: must be [low, high] with 0 < low"],
+            &["randomization.gains = [-1.0, 1.0]: must be [low, high] with 0 < low"],
         ),
         (
             &["randomization.delay=[3,2]"],
@@ -947,7 +947,7 @@ fn the_default_varies_nothing_before_its_ramp_begins() {
     ));
     for run in ["none", "fork"] {
         let share = config_of(&folder.join(run)).randomization.share;
-        assert!(share == Ramp::constant(0.0), "{run}: {share}");
+        assert!(share == Ramp::constant(0.0), "{run}: {share:?}");
         assert!(
             !metrics(&folder.join(run))[0]
                 .iter()

@@ -283,7 +283,7 @@ fn goals_that_live_for_some_steps_are_replaced_under_way_and_the_policy_sees_wha
     });
     let mut pool = EnvPool::new(3, envs.collect(), &Exchange::alone(1));
     let mut observations = vec![0.0; 8 * OBSERVATION_SIZE];
-    pool.reset(vec![&mut observations]);
+    pool.reset(observations.chunks_exact_mut(OBSERVATION_SIZE));
     let mut redirected = 0;
     for _ in 0..200 {
         let before: Vec<_> = pool
@@ -389,8 +389,7 @@ fn far_from_the_goal_actions_have_a_larger_noise_that_the_losses_know() {
     let task = task(&[]);
     let object = task.scene.free_body("cube").unwrap().qpos;
     let mut agent = started_agent(&task, &config(&sets));
-    let rows = agent.rollout.first_observations_mut().into_iter();
-    let rows = rows.flat_map(|rows| rows.chunks_exact_mut(OBSERVATION_SIZE));
+    let rows = agent.rollout.first_observations_mut();
     for (env, row) in agent.pool.envs_mut().zip(rows).step_by(2) {
         let goal = env.goal;
         env.sim.qpos_mut()[object + 3..object + 7].copy_from_slice(&goal);

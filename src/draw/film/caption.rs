@@ -1,14 +1,15 @@
 //! Text in the corner of a picture, on a darkened background.
 
-use ab_glyph::{Font, FontRef, OutlinedGlyph, PxScale, ScaleFont, point};
+use ab_glyph::{Font, FontRef, PxScale, ScaleFont, point};
+use plotters::backend::{BitMapBackend, DrawingBackend};
+use plotters::style::{Color, WHITE};
 
 /// Draws the lines into the top left corner of `rgb` `[height, width, 3]`. Text that does not fit is cut off.
 pub fn draw(rgb: &mut [u8], size: [u32; 2], lines: &[String]) {
     // All letters of this font have the same width.
     let font = FontRef::try_from_slice(epaint_default_fonts::HACK_REGULAR)
         .expect("the font is part of the program");
-    let [width, height] = size.map(|pixels| pixels as usize);
-    let scale = PxScale::from((height as f32 / 28.0).max(11.0));
+    let scale = PxScale::from((size[1] as f32 / 28.0).max(11.0));
     let scaled = font.as_scaled(scale);
     let advance = scaled.h_advance(scaled.glyph_id('0'));
     let spacing = (scaled.height() * 1.15).ceil();
@@ -18,37 +19,30 @@ pub fn draw(rgb: &mut [u8], size: [u32; 2], lines: &[String]) {
     let longest = lengths.max().unwrap_or(0);
     let across = longest as f32 * advance + 2.0 * margin;
     let down = lines.len() as f32 * spacing + margin;
+    let width = size[0] as usize;
     for row in rgb.chunks_exact_mut(3 * width).take(down as usize) {
         for channel in &mut row[..3 * width.min(across as usize)] {
             *channel = (u32::from(*channel) * 2 / 5) as u8;
         }
     }
+    let mut picture = BitMapBackend::with_buffer(rgb, size.into());
     for (i, line) in lines.iter().enumerate() {
         let baseline = 0.5 * margin + i as f32 * spacing + scaled.ascent();
         for (column, letter) in line.chars().enumerate() {
             let place = point(margin + column as f32 * advance, baseline);
             let glyph = scaled.glyph_id(letter);
             if let Some(outline) = font.outline_glyph(glyph.with_scale_and_position(scale, place)) {
-                draw_letter(rgb, [width, height], &outline);
+                let corner = outline.px_bounds().min;
+                outline.draw(|x, y, cover| {
+                    let x = corner.x as i32 + x as i32;
+                    let y = corner.y as i32 + y as i32;
+                    let drawn =
+                        picture.draw_pixel((x, y), WHITE.mix(cover.into()).to_backend_color());
+                    drawn.expect("memory can be written");
+                });
             }
         }
     }
-}
-
-fn draw_letter(rgb: &mut [u8], [width, height]: [usize; 2], outline: &OutlinedGlyph) {
-    let corner = outline.px_bounds().min;
-    outline.draw(|x, y, cover| {
-        let x = corner.x as i64 + i64::from(x);
-        let y = corner.y as i64 + i64::from(y);
-        if (0..width as i64).contains(&x) && (0..height as i64).contains(&y) {
-            let at = 3 * (y as usize * width + x as usize);
-            let cover = cover.clamp(0.0, 1.0);
-            for channel in &mut rgb[at..at + 3] {
-                let dark = f32::from(*channel);
-                *channel = (dark + (255.0 - dark) * cover) as u8;
-            }
-        }
-    });
 }
 
 #[cfg(test)]

@@ -68,7 +68,12 @@ impl Multiplier {
             Arithmetic::F32 => product(out, lhs, rhs, add),
             Arithmetic::Rounded => {
                 let [left, right] = &mut self.rounded;
-                product(out, round_into(left, lhs), round_into(right, rhs), add);
+                product(
+                    out,
+                    lhs.mapped(left, rounded),
+                    rhs.mapped(right, rounded),
+                    add,
+                );
             }
             Arithmetic::Bf16(unit) => {
                 let [left, right] = &mut self.packed;
@@ -81,10 +86,4 @@ impl Multiplier {
             }
         }
     }
-}
-
-fn round_into<'a>(room: &'a mut Vec<f32>, matrix: Matrix) -> Matrix<'a> {
-    room.clear();
-    room.extend(matrix.data().iter().map(|&x| rounded(x)));
-    matrix.with_data(room)
 }

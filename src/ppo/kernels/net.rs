@@ -195,15 +195,9 @@ impl<'a> Net<'a> {
 impl Dense<'_> {
     /// A copy of the weight, transposed.
     fn transposed(&self) -> Vec<f32> {
-        let mut weight_t = vec![0.0; self.inputs * self.outputs];
-        for (output, row) in self.weight.data().chunks_exact(self.inputs).enumerate() {
-            weight_t[output..]
-                .iter_mut()
-                .step_by(self.outputs)
-                .zip(row)
-                .for_each(|(to, &from)| *to = from);
-        }
-        weight_t
+        let data = self.weight.data();
+        let columns = (0..self.inputs).flat_map(|input| data[input..].iter().step_by(self.inputs));
+        columns.copied().collect()
     }
 
     /// The transposed weight, for a product with `rows` rows.

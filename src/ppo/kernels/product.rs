@@ -44,11 +44,12 @@ impl<'a> Matrix<'a> {
         self.strides
     }
 
-    /// A matrix of other data with the same layout.
-    pub fn with_data<'b>(&self, data: &'b [f32]) -> Matrix<'b> {
-        assert_eq!(data.len(), self.data.len(), "elements of a matrix");
+    /// A matrix with the same layout, whose elements are `f` of these and lie in `room`.
+    pub fn mapped<'b>(&self, room: &'b mut Vec<f32>, f: impl Fn(f32) -> f32) -> Matrix<'b> {
+        room.clear();
+        room.extend(self.data.iter().map(|&x| f(x)));
         Matrix {
-            data,
+            data: room,
             size: self.size,
             strides: self.strides,
         }
@@ -59,9 +60,9 @@ impl<'a> Matrix<'a> {
         let [rows, columns] = self.size;
         let [down, right] = self.strides;
         Self {
-            data: self.data,
             size: [columns, rows],
             strides: [right, down],
+            ..self
         }
     }
 }

@@ -31,26 +31,25 @@ fn dots() -> Answer<&'static str> {
 pub fn request() -> Result<&'static dyn Unit> {
     static ANSWER: OnceLock<Answer<String>> = OnceLock::new();
     let answer = ANSWER.get_or_init(|| {
-        checked(
-            tiles(),
-            "the tiles (AMX) of this processor multiply wrongly",
-        )
-        .or_else(|no_tiles| {
-            let dots = checked(
+        let mut reasons = Vec::new();
+        for (unit, wrong) in [
+            (
+                tiles(),
+                "the tiles (AMX) of this processor multiply wrongly",
+            ),
+            (
                 dots(),
                 "its dot products (AVX-512 BF16) are computed wrongly",
-            );
-            dots.map_err(|no_dots| format!("{no_tiles}, and {no_dots}"))
-        })
+            ),
+        ] {
+            match unit {
+                Ok(unit) if multiplies_rightly(unit) => return Ok(unit),
+                unit => reasons.push(unit.err().unwrap_or(wrong)),
+            }
+        }
+        Err(reasons.join(", and "))
     });
     answer.clone().map_err(|reason| anyhow!(reason))
-}
-
-fn checked(unit: Answer<&'static str>, wrong: &'static str) -> Answer<&'static str> {
-    match unit {
-        Ok(unit) if !multiplies_rightly(unit) => Err(wrong),
-        answer => answer,
-    }
 }
 
 /// Whether products of whole numbers, which need no rounding, are exact.
@@ -90,7 +89,7 @@ mod tests {
     /// On a machine that lacks a unit, only the error message is tested.
     #[test]
     fn products_of_rounded_numbers_on_amx_tiles_agree_with_doubles() {
-        match checked(tiles(), "wrong") {
+        match tiles() {
             Ok(unit) => products_agree_with_doubles(unit),
             Err(error) => assert!(error.contains("AMX"), "{error}"),
         }
@@ -99,7 +98,7 @@ mod tests {
     /// See above.
     #[test]
     fn products_of_rounded_numbers_by_avx512_agree_with_doubles() {
-        match checked(dots(), "wrong") {
+        match dots() {
             Ok(unit) => products_agree_with_doubles(unit),
             Err(error) => assert!(error.contains("AVX-512"), "{error}"),
         }
