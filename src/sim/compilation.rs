@@ -216,7 +216,8 @@ impl Compilation {
 /// Names the actuators, bodies and joints that have no name: by what they drive, what moves them, or what they move.
 fn name_parts(spec: &mut MjSpec) {
     for actuator in spec.actuator_iter_mut() {
-        give(actuator, "servo of", &actuator.target().to_owned());
+        let target = actuator.target().to_owned();
+        give(actuator, "servo of", &target);
     }
     name_within(spec.world_body_mut(), "the world");
 }

@@ -176,7 +176,11 @@ fn marks(model: &MjModel, body: usize) -> Option<Vec<Mark>> {
             }
         };
         let mut position = [0, 1, 2].map(|axis| low[axis] + half[axis]);
-        position[axis] += if face % 2 == 0 { distance } else { -distance };
+        position[axis] += if face.is_multiple_of(2) {
+            distance
+        } else {
+            -distance
+        };
         (kind, size, position, orientation)
     };
     let is_plain = |&(geom, _): &(usize, Placed)| model.geom_matid()[geom] < 0;

@@ -16,6 +16,15 @@ const MODELS: usize = 5;
 /// The memory that the training needs in this process, and that the machine has, GiB, where the system says them. The need is an
 /// estimate, before the environments are stepped.
 pub fn need(session: &Session) -> Option<[f64; 2]> {
+    let both = [
+        memory::used()? + growth(session) as f64,
+        memory::of_machine()?,
+    ];
+    Some(both.map(|bytes| bytes / f64::from(1 << 30)))
+}
+
+/// The memory that the training will need besides what is used before the environments are stepped, bytes.
+pub fn growth(session: &Session) -> usize {
     let Session {
         config,
         task,
@@ -30,10 +39,8 @@ pub fn need(session: &Session) -> Option<[f64; 2]> {
     let hidden: usize = config.ppo.hidden.iter().sum();
     let learner = 8 * config.samples_per_minibatch() * hidden * envs / config.env.num_envs;
     let models = (rayon::current_num_threads() + MODELS) * task.scene.size();
-    let more = envs * (CONTACTS + horizon * sample)
+    envs * (CONTACTS + horizon * sample)
         + config.run.eval_episodes * (ENVIRONMENT + CONTACTS)
         + models
-        + learner;
-    let both = [memory::used()? + more as f64, memory::of_machine()?];
-    Some(both.map(|bytes| bytes / f64::from(1 << 30)))
+        + learner
 }

@@ -285,7 +285,7 @@ fn a_checkpoint_that_was_made_to_harm_can_only_be_refused() {
         ),
         (
             set("log_std", &Array::F64(vec![20], vec![1.0; 20])),
-            "`log_std` must hold the same F32 value",
+            "`log_std` must be of type F32",
         ),
         (
             set("extra", &Array::U64(vec![1], vec![1])),
