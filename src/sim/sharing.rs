@@ -29,7 +29,7 @@ pub struct Variation {
 pub struct Varied {
     shared: Arc<MjModel>,
     /// It differs from the shared model in no other `places`.
-    pub(super) model: MjModel,
+    model: Arc<MjModel>,
     places: Vec<Range<usize>>,
 }
 
@@ -47,18 +47,24 @@ impl Varied {
             .take()
             .filter(|known| Arc::ptr_eq(&known.shared, shared));
         known.unwrap_or_else(|| Self {
-            model: (**shared).clone(),
+            model: Arc::new((**shared).clone()),
             shared: shared.clone(),
             places: Vec::new(),
         })
     }
 
+    /// Its model, to be changed. [`Varied::leave`] finds out how.
+    pub(super) fn model(&mut self) -> &mut MjModel {
+        Arc::get_mut(&mut self.model).expect("no simulation computes with it")
+    }
+
     /// The same place with the shared model but for a variation.
     fn with(mut self, variation: &Variation) -> Self {
-        let model = arrays_mut(&mut self.model);
-        let shared = arrays(&self.shared);
-        for place in mem::take(&mut self.places) {
-            model[place.clone()].copy_from_slice(&shared[place]);
+        let shared = self.shared.clone();
+        let places = mem::replace(&mut self.places, variation.places.clone());
+        let model = arrays_mut(self.model());
+        for place in places {
+            model[place.clone()].copy_from_slice(&arrays(&shared)[place]);
         }
         let mut bytes = &variation.bytes[..];
         for place in &variation.places {
@@ -66,9 +72,9 @@ impl Varied {
             model[place.clone()].copy_from_slice(here);
             bytes = rest;
         }
-        self.places.clone_from(&variation.places);
-        *self.model.opt_mut() = variation.options.clone();
-        *self.model.stat_mut() = variation.statistics.clone();
+        let model = self.model();
+        model.opt_mut().clone_from(&variation.options);
+        model.stat_mut().clone_from(&variation.statistics);
         self
     }
 
@@ -123,20 +129,12 @@ pub fn compute<T>(
     let Some(variation) = variation else {
         return act(data);
     };
-    let Varied {
-        shared,
-        model,
-        places,
-    } = Varied::take(shared).with(variation);
+    let varied = Varied::take(shared).with(variation);
     // SAFETY: the model has the structure of the one that it stands in for.
-    let resting = unsafe { data.swap_model_unchecked(Arc::new(model)) };
+    let resting = unsafe { data.swap_model_unchecked(varied.model.clone()) };
     let result = act(data);
     // SAFETY: as above.
-    let model = unsafe { data.swap_model_unchecked(resting) };
-    VARIED.set(Arc::into_inner(model).map(|model| Varied {
-        shared,
-        model,
-        places,
-    }));
+    unsafe { data.swap_model_unchecked(resting) };
+    VARIED.set(Some(varied));
     result
 }

@@ -109,8 +109,8 @@ impl Simulation {
         let mut varied = Varied::take(&self.nominal);
         // SAFETY: MuJoCo copies one model over another of the same sizes. It checks the sizes of their buffers itself, and ends the
         // process if they differ. The data could not have taken a scene of another structure.
-        unsafe { mj_copyModel(varied.model.ffi_mut(), scene.model.ffi()) };
-        change(&mut varied.model, changes, &mut self.data);
+        unsafe { mj_copyModel(varied.model().ffi_mut(), scene.model.ffi()) };
+        change(varied.model(), changes, &mut self.data);
         self.variation = Some(varied.leave());
     }
 }
