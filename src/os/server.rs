@@ -38,7 +38,7 @@ pub struct Server {
     /// What each request must have in its address: a query with a secret, or nothing.
     pub token: String,
     page: Mutex<String>,
-    on_post: Option<OnPost>,
+    on_post: OnPost,
     news: Mutex<News>,
     /// The permits of readers and of connections: each has a copy as long as it lives.
     readers: Arc<()>,
@@ -65,7 +65,7 @@ impl News {
 
 impl Server {
     /// Serves a page on this port of 127.0.0.1, whose readers get the event `hello` first. A proxy may run on another machine: for it,
-    /// the page is served on all addresses, and each request must have a token. Without `on_post`, no request changes anything.
+    /// the page is served on all addresses, and each request must have a token.
     ///
     /// # Errors
     /// Fails if the port cannot be opened, or if the system refuses a thread.
@@ -73,7 +73,7 @@ impl Server {
         (port, host): Place,
         page: String,
         hello: &str,
-        on_post: Option<OnPost>,
+        on_post: OnPost,
     ) -> Result<Arc<Self>> {
         let address = host.map_or(Ipv4Addr::LOCALHOST, |_| Ipv4Addr::UNSPECIFIED);
         let cannot = |error| {
@@ -191,8 +191,8 @@ impl Server {
         request.expect_known(&self.host, &self.token)?;
         let not_here = "This method is not allowed here.";
         // An error of a write is a reader that has gone, or has read nothing for too long.
-        let _ = match (&*request.method, &*request.name, &self.on_post) {
-            ("GET", "", _) => {
+        let _ = match (&*request.method, &*request.name) {
+            ("GET", "") => {
                 let page = self
                     .page
                     .lock()
@@ -200,21 +200,21 @@ impl Server {
                     .clone();
                 answer(stream, "200 OK", "text/html", &page)
             }
-            ("GET", "events", _) => {
+            ("GET", "events") => {
                 request.expect_own(!self.token.is_empty())?;
                 let permit = self.take_permit(&self.readers, MOST_READERS);
                 let _permit = permit.ok_or((CROWDED, "There are too many viewers."))?;
                 self.send_events(stream)
             }
-            ("POST", "controls", Some(on_post)) => {
+            ("POST", "controls") => {
                 request.expect_own(!self.token.is_empty())?;
-                on_post(&request.body).map_err(|sentence| ("400 Bad Request", sentence))?;
+                (self.on_post)(&request.body).map_err(|sentence| ("400 Bad Request", sentence))?;
                 stream.write_all(head("204 No Content", &[]).as_bytes())
             }
-            (_, "" | "events", _) => {
+            (_, "" | "events") => {
                 return Err(("405 Method Not Allowed\r\nAllow: GET", not_here));
             }
-            (_, "controls", Some(_)) => {
+            (_, "controls") => {
                 return Err(("405 Method Not Allowed\r\nAllow: POST", not_here));
             }
             _ => return Err(("404 Not Found", "There is no such page.")),

@@ -135,34 +135,23 @@ impl Sliders {
         Box::new(move |body| {
             let said = serde_json::from_slice(body).map_err(|_| MALFORMED)?;
             let mut state = own.state();
-            let moves: Vec<(usize, f64)> = match said {
-                Said::Moves(moves) => moves,
-                Said::Order(order) => {
-                    let is_finite = match order {
-                        Order::Push(_, force) => force.iter().all(|x| x.is_finite()),
-                        _ => true,
-                    };
-                    if !state.takes_orders || !is_finite {
-                        return Err(MALFORMED);
+            let count = state.sliders.len();
+            // All numbers of JSON are finite.
+            match said {
+                Said::Moves(moves) if moves.iter().all(|(slider, _)| *slider < count) => {
+                    for (slider, value) in moves {
+                        let slider = &mut state.sliders[slider];
+                        let [low, high] = slider.range;
+                        slider.value = Some(value.max(low).min(high));
+                        state.moved = true;
                     }
+                }
+                Said::Order(order) if state.takes_orders => {
                     if state.orders.len() < MOST_ORDERS {
                         state.orders.push(order);
                     }
-                    return Ok(());
                 }
-            };
-            let count = state.sliders.len();
-            if moves
-                .iter()
-                .any(|(slider, value)| *slider >= count || !value.is_finite())
-            {
-                return Err(MALFORMED);
-            }
-            for (slider, value) in moves {
-                let slider = &mut state.sliders[slider];
-                let [low, high] = slider.range;
-                slider.value = Some(value.max(low).min(high));
-                state.moved = true;
+                _ => return Err(MALFORMED),
             }
             Ok(())
         })
@@ -181,10 +170,9 @@ impl Sliders {
     /// Puts all sliders back.
     pub(super) fn reset(&self) {
         let mut state = self.state();
-        state
-            .sliders
-            .iter_mut()
-            .for_each(|slider| slider.value = None);
+        for slider in &mut state.sliders {
+            slider.value = None;
+        }
         state.moved = true;
     }
 
