@@ -169,9 +169,6 @@ impl Live {
     /// Takes over what the sliders say, and returns the other orders of the page.
     fn listen(&mut self) -> Vec<Order> {
         let orders = self.sliders.take_orders();
-        if orders.contains(&Order::Reset) {
-            self.sliders.reset();
-        }
         if self.sliders.take_moved() {
             self.server.greet(&self.hello());
             let values = json!(self.sliders.values());
@@ -196,12 +193,6 @@ impl Live {
                 _ => {}
             }
         }
-    }
-
-    fn send_row(&mut self, start: Instant) {
-        let row = self.row();
-        let time = start.elapsed().as_millis();
-        self.server.send(&format!("id: {time}\ndata: {row}\n\n"));
     }
 
     fn begin(&mut self, hand: usize, episode: usize, acting: LiveActor) {
@@ -232,8 +223,8 @@ impl Live {
         hello(&self.key, &self.hands, &self.sliders)
     }
 
-    /// The row of all hands, as the page reads it.
-    fn row(&mut self) -> String {
+    /// Sends the row of all hands, as the page reads it.
+    fn send_row(&mut self, start: Instant) {
         let rows = self.hands.iter_mut().flat_map(|hand| {
             let reward = std::mem::take(&mut hand.reward);
             self.columns.of(&hand.player.lane.env, reward)
@@ -241,7 +232,9 @@ impl Live {
         let bytes: Vec<u8> = rows
             .flat_map(|value| (value as f32).to_le_bytes())
             .collect();
-        BASE64_STANDARD.encode(bytes)
+        let row = BASE64_STANDARD.encode(bytes);
+        let time = start.elapsed().as_millis();
+        self.server.send(&format!("id: {time}\ndata: {row}\n\n"));
     }
 }
 
