@@ -107,9 +107,8 @@ fn record(moment: &Moment) -> Value {
     let episode = moment.episode;
     let step = env.episode().length;
     let Some((action, end)) = moment.step else {
-        let goal = env.goal;
         return json!({
-            "episode": episode, "step": step, "qpos": qpos, "qvel": qvel, "reset": true, "goal": goal, "obs": obs,
+            "episode": episode, "step": step, "qpos": qpos, "qvel": qvel, "reset": true, "goal": env.goal, "obs": obs,
         });
     };
     let details = &env.last;

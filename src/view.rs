@@ -126,5 +126,5 @@ fn show_on_page(args: &ViewArgs, port: u16, task: &Arc<Task>, choice: usize) -> 
     };
     let place = (port, args.shot.web_host.as_deref());
     let look = (&about, args.shot.camera);
-    see::Live::open(place, look, 1, &acting, Some(sliders))?.show(&mut || acting.clone())
+    see::Live::open(place, look, 1, &acting, sliders)?.show(&mut || acting.clone())
 }

@@ -10,7 +10,7 @@ use std::fs::{self, File, OpenOptions, TryLockError};
 use std::io::{self, Read};
 use std::os::unix::fs::{FileExt, MetadataExt};
 use std::path::{Path, PathBuf};
-use std::sync::{Arc, LazyLock, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, LazyLock, Mutex, MutexGuard};
 use std::thread;
 use std::time::{Duration, Instant, SystemTime};
 
@@ -19,6 +19,7 @@ use anyhow::{Context, Result, bail, ensure};
 use super::file::{Cannot, expect_named};
 use super::machine::Machine;
 use super::output::{Unfinished, nicety};
+use super::threads::locked;
 use super::{say, shortened, shown};
 
 /// The name of the lock file.
@@ -214,7 +215,7 @@ impl Heart {
 
     /// The time of the last heartbeat, if the lock file still belongs to this program.
     fn look(&self) -> MutexGuard<'_, Option<Instant>> {
-        let mut last = self.last.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut last = locked(&self.last);
         let lost = |time: Instant, content: String| {
             if time.elapsed() > WATCHED / 2 {
                 !content.starts_with(&name())

@@ -44,4 +44,4 @@ pub use terminal::{
     called_as, harmless, has_display, is_terminal, number, print, quoted, quoted_path, say_line,
     shortened, speak_as,
 };
-pub use threads::{start_threads, thread_pool};
+pub use threads::{locked, start_threads, thread_pool};

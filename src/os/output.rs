@@ -10,13 +10,14 @@ use std::io::{self, ErrorKind, Write};
 use std::os::fd::AsFd;
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
-use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::sync::Mutex;
 use std::time::Duration;
 
 use anyhow::{Result, bail, ensure};
 
 use super::file::{Cannot, expect_named, read_bytes};
 use super::quoted_path;
+use super::threads::locked;
 
 /// The prefix of the name of a file that is not complete yet, followed by the process id.
 const OUR_PARTIAL: &str = ".shadow-repose-";
@@ -45,7 +46,7 @@ impl Unfinished {
             "{OUR_PARTIAL}{}-{chance:016x}.partial",
             std::process::id()
         ));
-        unfinished().insert(path.clone());
+        locked(&UNFINISHED).insert(path.clone());
         Self { path }
     }
 
@@ -57,13 +58,9 @@ impl Unfinished {
     }
 }
 
-fn unfinished() -> MutexGuard<'static, BTreeSet<PathBuf>> {
-    UNFINISHED.lock().unwrap_or_else(PoisonError::into_inner)
-}
-
 impl Drop for Unfinished {
     fn drop(&mut self) {
-        let mut unfinished = unfinished();
+        let mut unfinished = locked(&UNFINISHED);
         remove(&self.path);
         unfinished.remove(&self.path);
     }
@@ -71,7 +68,7 @@ impl Drop for Unfinished {
 
 /// Removes everything that this process has not finished, just before it exits. Nothing can be started afterwards.
 pub fn remove_unfinished() {
-    let unfinished = unfinished();
+    let unfinished = locked(&UNFINISHED);
     unfinished.iter().for_each(|path| remove(path));
     std::mem::forget(unfinished);
 }
@@ -96,9 +93,7 @@ pub fn is_abandoned(entry: &DirEntry) -> bool {
         Ok(Ok(())) => true,
         Ok(Err(TryLockError::WouldBlock)) => false,
         _ => {
-            let written = fs::symlink_metadata(entry.path())
-                .and_then(|facts| facts.modified())
-                .ok();
+            let written = entry.metadata().and_then(|facts| facts.modified()).ok();
             written
                 .and_then(|written| written.elapsed().ok())
                 .is_some_and(|age| age > LONG_AGO)

@@ -55,14 +55,10 @@ pub fn text_of(lines: &[String]) -> String {
 pub fn aligned(rows: &[Vec<String>], words: usize) -> Vec<String> {
     let columns = rows.iter().map(Vec::len).max().unwrap_or(0);
     let width = |column: usize| {
-        rows.iter()
-            .filter_map(|row| row.get(column))
-            .map(|cell| measure_text_width(cell))
-            .max()
+        let cells = rows.iter().filter_map(|row| row.get(column));
+        cells.map(|cell| measure_text_width(cell)).max()
     };
-    let widths: Vec<usize> = (0..columns)
-        .map(|column| width(column).unwrap_or(0))
-        .collect();
+    let widths: Vec<usize> = (0..columns).filter_map(width).collect();
     let cell = |(column, text): (usize, &String)| -> String {
         let room = " ".repeat(widths[column] - measure_text_width(text));
         match column {

@@ -3,13 +3,14 @@
 use std::collections::VecDeque;
 use std::io::Write;
 use std::net::{Ipv4Addr, TcpListener, TcpStream};
-use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Condvar, Mutex, PoisonError};
 use std::thread;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, anyhow};
 
 use super::http::{PATIENCE, Refusal, Request, answer, head, refuse};
+use super::threads::locked;
 
 /// The most readers of events, and the most connections, including connections that only fetch the page.
 const MOST_READERS: usize = 8;
@@ -38,7 +39,7 @@ pub struct Server {
     /// What each request must have in its address: a query with a secret, or nothing.
     pub token: String,
     page: Mutex<String>,
-    on_post: Option<OnPost>,
+    on_post: OnPost,
     news: Mutex<News>,
     /// The permits of readers and of connections: each has a copy as long as it lives.
     readers: Arc<()>,
@@ -65,7 +66,7 @@ impl News {
 
 impl Server {
     /// Serves a page on this port of 127.0.0.1, whose readers get the event `hello` first. A proxy may run on another machine: for it,
-    /// the page is served on all addresses, and each request must have a token. Without `on_post`, no request changes anything.
+    /// the page is served on all addresses, and each request must have a token.
     ///
     /// # Errors
     /// Fails if the port cannot be opened, or if the system refuses a thread.
@@ -73,7 +74,7 @@ impl Server {
         (port, host): Place,
         page: String,
         hello: &str,
-        on_post: Option<OnPost>,
+        on_post: OnPost,
     ) -> Result<Arc<Self>> {
         let address = host.map_or(Ipv4Addr::LOCALHOST, |_| Ipv4Addr::UNSPECIFIED);
         let cannot = |error| {
@@ -110,17 +111,17 @@ impl Server {
 
     /// Serves another page from now on.
     pub fn replace_page(&self, page: String) {
-        *self.page.lock().unwrap_or_else(PoisonError::into_inner) = page;
+        *locked(&self.page) = page;
     }
 
     /// Sets the event that readers get first.
     pub fn greet(&self, hello: &str) {
-        self.news().hello = hello.into();
+        locked(&self.news).hello = hello.into();
     }
 
     /// Sends events, each as the protocol writes it, to all readers. Readers that are too late miss them.
     pub fn send(&self, events: &str) {
-        let mut news = self.news();
+        let mut news = locked(&self.news);
         news.events.push_back(events.into());
         if news.events.len() > KEPT {
             news.events.pop_front();
@@ -132,15 +133,10 @@ impl Server {
     /// Waits until somebody reads the events, and returns whether it had to.
     pub fn wait_for_reader(&self) -> bool {
         let is_alone = || Arc::strong_count(&self.readers) == 1;
-        let news = self.news();
+        let news = locked(&self.news);
         let waits = is_alone();
         drop(self.changed.wait_while(news, |_| is_alone()));
         waits
-    }
-
-    /// The news. They are consistent even after a panic of a thread that held them.
-    fn news(&self) -> MutexGuard<'_, News> {
-        self.news.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     fn accept(self: Arc<Self>, listener: &TcpListener) {
@@ -172,7 +168,7 @@ impl Server {
     /// A permit, to be kept as long as it is used, unless there are `most` of them already.
     fn take_permit(&self, permits: &Arc<()>, most: usize) -> Option<Arc<()>> {
         // Nobody else counts meanwhile.
-        let _news = self.news();
+        let _news = locked(&self.news);
         let permit = (Arc::strong_count(permits) <= most).then(|| permits.clone());
         self.changed.notify_all();
         permit
@@ -191,30 +187,26 @@ impl Server {
         request.expect_known(&self.host, &self.token)?;
         let not_here = "This method is not allowed here.";
         // An error of a write is a reader that has gone, or has read nothing for too long.
-        let _ = match (&*request.method, &*request.name, &self.on_post) {
-            ("GET", "", _) => {
-                let page = self
-                    .page
-                    .lock()
-                    .unwrap_or_else(PoisonError::into_inner)
-                    .clone();
+        let _ = match (&*request.method, &*request.name) {
+            ("GET", "") => {
+                let page = locked(&self.page).clone();
                 answer(stream, "200 OK", "text/html", &page)
             }
-            ("GET", "events", _) => {
+            ("GET", "events") => {
                 request.expect_own(!self.token.is_empty())?;
                 let permit = self.take_permit(&self.readers, MOST_READERS);
                 let _permit = permit.ok_or((CROWDED, "There are too many viewers."))?;
                 self.send_events(stream)
             }
-            ("POST", "controls", Some(on_post)) => {
+            ("POST", "controls") => {
                 request.expect_own(!self.token.is_empty())?;
-                on_post(&request.body).map_err(|sentence| ("400 Bad Request", sentence))?;
+                (self.on_post)(&request.body).map_err(|sentence| ("400 Bad Request", sentence))?;
                 stream.write_all(head("204 No Content", &[]).as_bytes())
             }
-            (_, "" | "events", _) => {
+            (_, "" | "events") => {
                 return Err(("405 Method Not Allowed\r\nAllow: GET", not_here));
             }
-            (_, "controls", Some(_)) => {
+            (_, "controls") => {
                 return Err(("405 Method Not Allowed\r\nAllow: POST", not_here));
             }
             _ => return Err(("404 Not Found", "There is no such page.")),
@@ -225,7 +217,7 @@ impl Server {
     fn send_events(&self, stream: &mut TcpStream) -> std::io::Result<()> {
         let more = ["Content-Type: text/event-stream", "X-Accel-Buffering: no"];
         let (mut text, mut next) = {
-            let news = self.news();
+            let news = locked(&self.news);
             (head("200 OK", &more) + &news.hello, news.next())
         };
         // A proxy must ask again: it may go on reading when its reader has gone.
@@ -234,7 +226,7 @@ impl Server {
             stream.write_all(text.as_bytes())?;
             let waited = self
                 .changed
-                .wait_timeout_while(self.news(), QUIET, |news| news.next() == next);
+                .wait_timeout_while(locked(&self.news), QUIET, |news| news.next() == next);
             let (news, _) = waited.unwrap_or_else(PoisonError::into_inner);
             text = match next.checked_sub(news.first) {
                 Some(old) if old < news.events.len() as u64 => {

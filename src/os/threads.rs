@@ -1,4 +1,6 @@
-//! The worker threads of the program.
+//! The worker threads of the program, and what threads share.
+
+use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use anyhow::{Result, anyhow, ensure};
 use rayon::{ThreadPool, ThreadPoolBuildError, ThreadPoolBuilder};
@@ -35,4 +37,9 @@ fn start<T>(
     // The text of this error already contains the text of its source.
     let started = build(ThreadPoolBuilder::new().num_threads(threads));
     started.map_err(|error| anyhow!("cannot start {threads} worker threads: {error}"))
+}
+
+/// What threads share, for one of them at a time. It must be consistent even where a thread that had it panics.
+pub fn locked<T>(shared: &Mutex<T>) -> MutexGuard<'_, T> {
+    shared.lock().unwrap_or_else(PoisonError::into_inner)
 }

@@ -9,7 +9,7 @@ use serde_json::{Value, json};
 use toml::Table;
 
 use super::stage::{Stage, with_warnings};
-use crate::config::{EnvConfig, MODEL, Override, Reader, Settings, Source, short};
+use crate::config::{MODEL, Override, Reader, Settings, Source, short};
 use crate::load::PolicySource;
 use crate::os::{self, Destination, Place, Stamp, say};
 use crate::repose::Task;
@@ -138,20 +138,15 @@ fn sliders(stage: &Stage) -> Sliders {
     Sliders::new(sliders, true)
 }
 
-/// The settings that the sliders have changed.
-fn changed(sliders: &Sliders, task: &EnvConfig) -> Vec<Override> {
-    let values = sliders.values();
-    let values = SETTINGS.iter().zip(&values[FACTORS.len()..]);
-    let usual = [
-        task.cube_size_scale,
-        task.action_delay.into(),
-        task.prediction.into(),
-    ];
-    let values = values
-        .zip(usual)
-        .filter(|((_, value), usual)| **value != *usual);
-    values
-        .map(|(((key, ..), value), _)| Override {
+/// The settings of sliders whose values are not the `usual` ones.
+fn changed(usual: &[f64], values: &[f64]) -> Vec<Override> {
+    let values = usual.iter().zip(values).skip(FACTORS.len());
+    let changed = SETTINGS
+        .iter()
+        .zip(values)
+        .filter(|(_, (usual, value))| usual != value);
+    changed
+        .map(|((key, ..), (_, value))| Override {
             key: (*key).into(),
             value: value.to_string(),
         })
@@ -171,6 +166,7 @@ pub fn live(
     (seed, set): (u64, &[Override]),
 ) -> Result<ExitCode> {
     let sliders = sliders(&stage);
+    let usual = sliders.values();
     let own = sliders.clone();
     let draws: Rc<dyn Fn() -> bool> =
         Rc::new(move || own.values().get(FACTORS.len() + SETTINGS.len()) == Some(&1.0));
@@ -188,7 +184,7 @@ pub fn live(
     let stage = Rc::new(stage);
     let mut acting = stage.clone().acting(task.clone(), draws.clone());
     let look = (&about, shot.camera);
-    let live = Live::open(place, look, hands as usize, &acting, Some(sliders.clone()))?;
+    let live = Live::open(place, look, hands as usize, &acting, sliders.clone())?;
     let load = |sets: &[Override]| {
         let newer = Stage {
             choice: stage.choice,
@@ -212,7 +208,7 @@ pub fn live(
     };
     let mut known = Vec::new();
     live.show(&mut || {
-        let sets = changed(&sliders, &task.config);
+        let sets = changed(&usual, &sliders.values());
         if followed.as_mut().is_some_and(Followed::has_changed) || sets != known {
             match load(&sets) {
                 Ok(newer) => acting = newer,

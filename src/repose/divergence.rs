@@ -1,6 +1,6 @@
 //! How the physics of an episode diverged: its last steps, as JSON that any MuJoCo can replay.
 
-use serde_json::{Value, json};
+use serde_json::json;
 
 use super::EpisodePhysics;
 use super::physics::add_settings;
@@ -39,10 +39,7 @@ impl Diverged {
             "actions": actions,
         });
         add_settings(config, &mut dump);
-        dump["randomization"] = self
-            .draw
-            .as_ref()
-            .map_or(Value::Null, |draw| draw.physics.as_json());
+        dump["randomization"] = self.draw.as_ref().map(|draw| draw.physics.as_json()).into();
         dump["pushes"] = json!(tail.pushes);
         dump["torques"] = json!(tail.torques);
         format!("{dump}\n")

@@ -1,5 +1,7 @@
 //! The hand in a scene: its parts in the task's order, bound once, and the layout of observations that follows from them.
 
+use std::collections::BTreeSet;
+
 use anyhow::{Error, Result, bail, ensure};
 
 use super::observation::Layout;
@@ -169,15 +171,13 @@ fn shadow_hand(scene: &Scene) -> Option<Parts> {
 /// # Errors
 /// Fails if a fingertip is no part of a hand.
 fn roots(scene: &Scene, parts: &Parts, fingertips: &[Frame]) -> Result<Vec<Body>> {
-    let mut roots: Vec<Body> = fingertips.iter().map(|&tip| scene.root(tip)).collect();
-    roots.sort();
-    roots.dedup();
+    let roots: BTreeSet<Body> = fingertips.iter().map(|&tip| scene.root(tip)).collect();
     let others = ["world", &parts.object, &parts.goal].map(|name| scene.body(name).ok());
     ensure!(
         roots.iter().all(|&root| !others.contains(&Some(root))),
         "hand.fingertips must name parts of the hand, and not the world, the object or the goal"
     );
-    Ok(roots)
+    Ok(Vec::from_iter(roots))
 }
 
 /// Finds each of these names, and lists what is wrong.

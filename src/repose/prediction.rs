@@ -1,12 +1,12 @@
 //! Where the hand will be when an action takes effect: a model of it runs forward through the targets that are still on their way.
 
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex};
 
 use anyhow::{Result, ensure};
 
 use super::hand::Hand;
 use crate::config::EnvConfig;
-use crate::os::shortened;
+use crate::os::{locked, shortened};
 use crate::quat;
 use crate::sim::{Pose, Scene, Simulation, origin};
 
@@ -54,8 +54,7 @@ impl Predictor {
         goal: Pose,
         targets: &[f64],
     ) -> Option<Simulation> {
-        let mut sim = self
-            .idle()
+        let mut sim = locked(&self.idle)
             .pop()
             .unwrap_or_else(|| Simulation::new(&self.scene));
         sim.reset();
@@ -85,11 +84,7 @@ impl Predictor {
 
     /// Keeps a simulation for the next prediction.
     pub fn give_back(&self, sim: Simulation) {
-        self.idle().push(sim);
-    }
-
-    fn idle(&self) -> MutexGuard<'_, Vec<Simulation>> {
-        self.idle.lock().unwrap_or_else(PoisonError::into_inner)
+        locked(&self.idle).push(sim);
     }
 }
 

@@ -1,5 +1,7 @@
 //! The meshes of the real Shadow Hand, which are shown over the primitives of the built-in scene.
 
+use std::collections::BTreeSet;
+
 use crate::sim::{Dress, Piece};
 
 /// A part of the hand: the end of its body's name, mesh file, material in the built-in scene, height above the body's origin in m.
@@ -34,13 +36,10 @@ const FINGER: [MeshPart; 4] = [
 
 /// The mesh files of the hand, sorted and without duplicates.
 pub fn mesh_files() -> Vec<&'static str> {
-    let mut files: Vec<&str> = PARTS
+    let files = PARTS
         .iter()
-        .flat_map(|(_, parts)| parts.iter().map(|part| part.1))
-        .collect();
-    files.sort_unstable();
-    files.dedup();
-    files
+        .flat_map(|(_, parts)| parts.iter().map(|part| part.1));
+    Vec::from_iter(BTreeSet::from_iter(files))
 }
 
 /// The meshes on a hand whose names have this prefix, given the contents of [`mesh_files`] in that order.

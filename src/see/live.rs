@@ -50,7 +50,7 @@ pub struct Live {
     camera: Option<Camera>,
     columns: Columns,
     server: Arc<Server>,
-    sliders: Option<Sliders>,
+    sliders: Sliders,
     key: String,
     /// Control steps from row to row.
     every: u64,
@@ -81,24 +81,19 @@ impl Live {
         (about, camera): (&About, Option<Camera>),
         hands: usize,
         acting: &LiveActor,
-        sliders: Option<Sliders>,
+        sliders: Sliders,
     ) -> Result<Self> {
         let mut columns = Columns::new(&acting.task, camera);
         let every = (BETWEEN_ROWS / acting.task.config.ctrl_dt).round().max(1.0) as u64;
-        let more = more(hands, every, sliders.as_ref(), &acting.task);
+        let more = more(hands, every, &sliders, &acting.task);
         let page = columns.page(about, more, Vec::new());
         let key = page.key();
         let episodes = Episodes::scored(about.seed.unwrap_or(0), usize::MAX);
         let hands: Vec<_> = (0..hands)
             .map(|episode| LiveHand::new(acting.clone(), episode, episodes))
             .collect();
-        let hello = hello(&key, &hands, sliders.as_ref());
-        let server = Server::open(
-            place,
-            page.html(),
-            &hello,
-            sliders.as_ref().map(Sliders::on_post),
-        )?;
+        let hello = hello(&key, &hands, &sliders);
+        let server = Server::open(place, page.html(), &hello, sliders.on_post())?;
         let Server { port, token, .. } = &*server;
         let machine = Machine::this().name;
         os::say!(
@@ -133,21 +128,22 @@ impl Live {
                 clock.pause();
             }
             let orders = self.listen();
+            let mut single = 0;
             for order in &orders {
-                paused = match order {
-                    Order::Pause => !paused,
-                    Order::Step => true,
-                    _ => paused,
-                };
-                self.obey(*order);
-            }
-            let single = orders.iter().filter(|order| **order == Order::Step);
-            let due = match paused {
-                true => {
-                    clock.pause();
-                    single.count() as u32
+                match order {
+                    Order::Pause => paused = !paused,
+                    Order::Step => {
+                        paused = true;
+                        single += 1;
+                    }
+                    _ => self.obey(*order),
                 }
-                false => clock.steps_due(1.0),
+            }
+            let due = if paused {
+                clock.pause();
+                single
+            } else {
+                clock.steps_due(1.0)
             };
             for _ in 0..due {
                 for hand in 0..self.hands.len() {
@@ -172,33 +168,17 @@ impl Live {
 
     /// Takes over what the sliders say, and returns the other orders of the page.
     fn listen(&mut self) -> Vec<Order> {
-        let Some(sliders) = self.sliders.clone() else {
-            return Vec::new();
-        };
-        let orders = sliders.take_orders();
-        if orders.contains(&Order::Reset) {
-            sliders.reset();
-        }
-        if sliders.take_moved() {
-            self.greet();
-            self.server
-                .send(&event("controls", &json!(sliders.values())));
-            (0..self.hands.len()).for_each(|hand| self.vary(hand));
+        let orders = self.sliders.take_orders();
+        if self.sliders.take_moved() {
+            self.server.greet(&self.hello());
+            let values = json!(self.sliders.values());
+            self.server.send(&event("controls", &values));
+            let factors = self.sliders.factors();
+            for hand in &mut self.hands {
+                hand.vary(&factors);
+            }
         }
         orders
-    }
-
-    /// Gives a hand the physics that the sliders say. A hand whose physics has diverged ends its episode.
-    fn vary(&mut self, hand: usize) {
-        let factors = self
-            .sliders
-            .as_ref()
-            .map(Sliders::factors)
-            .unwrap_or_default();
-        let hand = &mut self.hands[hand];
-        if !factors.is_empty() {
-            hand.has_ended |= hand.player.lane.env.vary(&factors).is_err();
-        }
     }
 
     fn obey(&mut self, order: Order) {
@@ -215,44 +195,36 @@ impl Live {
         }
     }
 
-    fn send_row(&mut self, start: Instant) {
-        let row = self.row();
-        let time = start.elapsed().as_millis();
-        self.server.send(&format!("id: {time}\ndata: {row}\n\n"));
-    }
-
     fn begin(&mut self, hand: usize, episode: usize, acting: LiveActor) {
         let size = |task: &Task| task.config.cube_size_scale;
         if size(&acting.task) != size(&self.hands[hand].acting.task) {
             self.redraw(&acting.task);
         }
         self.hands[hand] = LiveHand::new(acting, episode, self.episodes);
-        self.vary(hand);
+        self.hands[hand].vary(&self.sliders.factors());
         let mut about = self.hands[hand].about.clone();
         about["hand"] = hand.into();
         // First, so that a viewer who comes in between knows it.
-        self.greet();
+        self.server.greet(&self.hello());
         self.server.send(&event("episode", &about));
     }
 
     /// Serves a page with the shapes of another task. Readers of the old one load it when they are greeted.
     fn redraw(&mut self, task: &Arc<Task>) {
         self.columns = Columns::new(task, self.camera);
-        let more = more(self.hands.len(), self.every, self.sliders.as_ref(), task);
+        let more = more(self.hands.len(), self.every, &self.sliders, task);
         let page = self.columns.page(&self.about, more, Vec::new());
         self.key = page.key();
         self.server.replace_page(page.html());
-        let hello = hello(&self.key, &self.hands, self.sliders.as_ref());
-        self.server.send(&hello);
+        self.server.send(&self.hello());
     }
 
-    fn greet(&self) {
-        self.server
-            .greet(&hello(&self.key, &self.hands, self.sliders.as_ref()));
+    fn hello(&self) -> String {
+        hello(&self.key, &self.hands, &self.sliders)
     }
 
-    /// The row of all hands, as the page reads it.
-    fn row(&mut self) -> String {
+    /// Sends the row of all hands, as the page reads it.
+    fn send_row(&mut self, start: Instant) {
         let rows = self.hands.iter_mut().flat_map(|hand| {
             let reward = std::mem::take(&mut hand.reward);
             self.columns.of(&hand.player.lane.env, reward)
@@ -260,7 +232,9 @@ impl Live {
         let bytes: Vec<u8> = rows
             .flat_map(|value| (value as f32).to_le_bytes())
             .collect();
-        BASE64_STANDARD.encode(bytes)
+        let row = BASE64_STANDARD.encode(bytes);
+        let time = start.elapsed().as_millis();
+        self.server.send(&format!("id: {time}\ndata: {row}\n\n"));
     }
 }
 
@@ -288,6 +262,13 @@ impl LiveHand {
         }
     }
 
+    /// Changes the physics by these factors. A hand whose physics has diverged ends its episode.
+    fn vary(&mut self, factors: &[(&str, f64)]) {
+        if !factors.is_empty() {
+            self.has_ended |= self.player.lane.env.vary(factors).is_err();
+        }
+    }
+
     fn step(&mut self) {
         if let Some((force, since)) = self.push {
             let lasts = since.elapsed() < HELD;
@@ -302,25 +283,24 @@ impl LiveHand {
 }
 
 /// What a live page needs to know besides what it shows.
-fn more(hands: usize, every: u64, sliders: Option<&Sliders>, task: &Task) -> Value {
-    let mut more = json!({ "live": true, "hands": hands, "every": every });
-    if let Some(sliders) = sliders {
-        more["sliders"] = sliders.described();
-        if sliders.takes_orders() {
-            let object = &task.hand.object;
-            more["object"] = json!({ "at": object.qpos, "mass": task.scene.mass(object.body) });
-        }
-    }
-    more
+fn more(hands: usize, every: u64, sliders: &Sliders, task: &Task) -> Value {
+    let object = &task.hand.object;
+    let pushed = sliders
+        .takes_orders()
+        .then(|| json!({ "at": object.qpos, "mass": task.scene.mass(object.body) }));
+    json!({
+        "live": true,
+        "hands": hands,
+        "every": every,
+        "sliders": sliders.described(),
+        "object": pushed,
+    })
 }
 
 /// The first event for a viewer: the key of the page, and what is under way.
-fn hello(key: &str, hands: &[LiveHand], sliders: Option<&Sliders>) -> String {
+fn hello(key: &str, hands: &[LiveHand], sliders: &Sliders) -> String {
     let episodes: Value = hands.iter().map(|hand| hand.about.clone()).collect();
-    let mut hello = json!({ "key": key, "episodes": episodes });
-    if let Some(sliders) = sliders {
-        hello["controls"] = json!(sliders.values());
-    }
+    let hello = json!({ "key": key, "episodes": episodes, "controls": sliders.values() });
     event("hello", &hello)
 }
 
@@ -354,7 +334,14 @@ mod tests {
             seed: None,
         };
         let [first, second] = [task(&[]), task(&["env.max_episode_seconds=3"])];
-        let mut live = Live::open((0, None), (&about, None), 1, &acting(&first), None).unwrap();
+        let mut live = Live::open(
+            (0, None),
+            (&about, None),
+            1,
+            &acting(&first),
+            Sliders::new(Vec::new(), false),
+        )
+        .unwrap();
         let seconds = |live: &Live| {
             live.hands[0]
                 .player
@@ -387,7 +374,7 @@ mod tests {
         let sliders = Sliders::new(vec![mass], true);
         let post = sliders.on_post();
         let open = |sliders: &Sliders| {
-            Live::open((0, None), (&about, None), 1, &acting, Some(sliders.clone())).unwrap()
+            Live::open((0, None), (&about, None), 1, &acting, sliders.clone()).unwrap()
         };
         let height = |live: &mut Live| {
             (0..10).for_each(|_| live.hands[0].step());

@@ -1,12 +1,12 @@
 //! The sliders and buttons of a page, by which its readers move a hand or change its world.
 
 use std::mem::take;
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex};
 
 use serde::Deserialize;
 use serde_json::{Value, json};
 
-use crate::os::OnPost;
+use crate::os::{OnPost, locked};
 use crate::repose::Task;
 
 /// The answer to a request that asks for nothing.
@@ -121,7 +121,7 @@ impl Sliders {
 
     /// Changes an action to what the sliders of actuators ask for: -1 and 1 are the ends of the range of an actuator.
     pub fn change(&self, action: &mut [f32]) {
-        for (action, slider) in action.iter_mut().zip(&self.state().sliders) {
+        for (action, slider) in action.iter_mut().zip(&locked(&self.0).sliders) {
             let [low, high] = slider.range;
             if let Some(value) = slider.value.filter(|_| low < high) {
                 *action = (2.0 * (value - low) / (high - low) - 1.0) as f32;
@@ -134,35 +134,31 @@ impl Sliders {
         let own = self.clone();
         Box::new(move |body| {
             let said = serde_json::from_slice(body).map_err(|_| MALFORMED)?;
-            let mut state = own.state();
-            let moves: Vec<(usize, f64)> = match said {
-                Said::Moves(moves) => moves,
-                Said::Order(order) => {
-                    let is_finite = match order {
-                        Order::Push(_, force) => force.iter().all(|x| x.is_finite()),
-                        _ => true,
-                    };
-                    if !state.takes_orders || !is_finite {
-                        return Err(MALFORMED);
+            let mut state = locked(&own.0);
+            let count = state.sliders.len();
+            // All numbers of JSON are finite.
+            match said {
+                Said::Moves(moves) if moves.iter().all(|(slider, _)| *slider < count) => {
+                    for (slider, value) in moves {
+                        let slider = &mut state.sliders[slider];
+                        let [low, high] = slider.range;
+                        slider.value = Some(value.max(low).min(high));
+                        state.moved = true;
+                    }
+                }
+                Said::Order(order) if state.takes_orders => {
+                    if order == Order::Reset {
+                        state
+                            .sliders
+                            .iter_mut()
+                            .for_each(|slider| slider.value = None);
+                        state.moved = true;
                     }
                     if state.orders.len() < MOST_ORDERS {
                         state.orders.push(order);
                     }
-                    return Ok(());
                 }
-            };
-            let count = state.sliders.len();
-            if moves
-                .iter()
-                .any(|(slider, value)| *slider >= count || !value.is_finite())
-            {
-                return Err(MALFORMED);
-            }
-            for (slider, value) in moves {
-                let slider = &mut state.sliders[slider];
-                let [low, high] = slider.range;
-                slider.value = Some(value.max(low).min(high));
-                state.moved = true;
+                _ => return Err(MALFORMED),
             }
             Ok(())
         })
@@ -170,33 +166,23 @@ impl Sliders {
 
     /// Whether one has moved since the last call.
     pub(super) fn take_moved(&self) -> bool {
-        take(&mut self.state().moved)
+        take(&mut locked(&self.0).moved)
     }
 
     /// The orders since the last call.
     pub(super) fn take_orders(&self) -> Vec<Order> {
-        take(&mut self.state().orders)
-    }
-
-    /// Puts all sliders back.
-    pub(super) fn reset(&self) {
-        let mut state = self.state();
-        state
-            .sliders
-            .iter_mut()
-            .for_each(|slider| slider.value = None);
-        state.moved = true;
+        take(&mut locked(&self.0).orders)
     }
 
     /// The value of each.
     pub fn values(&self) -> Vec<f64> {
-        self.state().sliders.iter().map(Slider::value).collect()
+        locked(&self.0).sliders.iter().map(Slider::value).collect()
     }
 
     /// The factors on quantities of the physics.
     pub(super) fn factors(&self) -> Vec<(&'static str, f64)> {
         let factor = |slider: &Slider| Some((slider.quantity?, slider.value()));
-        self.state().sliders.iter().filter_map(factor).collect()
+        locked(&self.0).sliders.iter().filter_map(factor).collect()
     }
 
     /// What a page needs to show them.
@@ -205,16 +191,12 @@ impl Sliders {
             let [low, high] = slider.range;
             json!({ "name": slider.name, "low": low, "high": high, "step": slider.step, "value": slider.start })
         };
-        self.state().sliders.iter().map(described).collect()
+        locked(&self.0).sliders.iter().map(described).collect()
     }
 
     /// Whether the page may also push the object and press buttons.
     pub(super) fn takes_orders(&self) -> bool {
-        self.state().takes_orders
-    }
-
-    fn state(&self) -> MutexGuard<'_, State> {
-        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+        locked(&self.0).takes_orders
     }
 }
 
@@ -286,7 +268,7 @@ mod tests {
         assert_eq!(sliders.take_orders().len(), MOST_ORDERS);
         post(b"[[0,9]]").unwrap();
         assert_eq!(sliders.values(), [2.0]);
-        sliders.reset();
+        post(b"\"reset\"").unwrap();
         assert!(sliders.values() == [1.0] && sliders.take_moved());
     }
 }

@@ -104,16 +104,9 @@ impl Compilation {
             return Ok(of(known.clone()));
         }
         let in_memory = of(Arc::new(SceneFiles::read(scene)?));
-        let [there, here] = [&self, &in_memory].map(|own| own.compile(file).ok());
-        let is_same = there
-            .zip(here)
-            .is_some_and(|(there, here)| bytes(&there) == bytes(&here));
+        let [there, here] = [&self, &in_memory].map(|own| bytes(&own.compile(file).ok()?));
+        let is_same = there.is_some() && there == here;
         Ok(if is_same { in_memory } else { self })
-    }
-
-    /// Whether it keeps all of a scene but its options and its looks.
-    fn keeps_all(&self) -> bool {
-        self.size == 1.0 && !self.shifts && self.adds_goal.is_none()
     }
 
     /// Compiles the built-in scene (`None`) or a user's file.
@@ -188,7 +181,7 @@ impl Compilation {
         if self.names_parts {
             name_parts(&mut spec);
         }
-        if self.keeps_all() {
+        if self.size == 1.0 && !self.shifts && self.adds_goal.is_none() {
             return Ok(spec);
         }
         let name = &self.object;

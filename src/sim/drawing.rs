@@ -9,6 +9,7 @@ use super::Scene;
 use super::constants::*;
 use super::look::{Camera, HIDDEN, is_of};
 use crate::draw::Mesh;
+use crate::quat;
 
 /// A scene as a page draws it. Lengths in m, quaternions w, x, y, z.
 pub struct Drawing {
@@ -237,8 +238,8 @@ fn normal_of([a, b, c]: [[f32; 3]; 3]) -> [f64; 3] {
         u[2] * v[0] - u[0] * v[2],
         u[0] * v[1] - u[1] * v[0],
     ];
-    let length = normal.iter().map(|x| x * x).sum::<f64>().sqrt();
-    normal.map(|x| x / length.max(f64::MIN_POSITIVE))
+    let length = quat::length(&normal).max(f64::MIN_POSITIVE);
+    normal.map(|x| x / length)
 }
 
 fn camera(model: &MjModel, from: Option<Camera>) -> Value {

@@ -5,9 +5,11 @@
 
 use std::cell::Cell;
 use std::panic::{AssertUnwindSafe, catch_unwind};
-use std::sync::{Mutex, Once, PoisonError};
+use std::sync::{Mutex, Once};
 
 use mujoco_rs::wrappers::mj_logging::{MjLogMessage, MjtLogLevel};
+
+use crate::os::{drain, locked, remove_unfinished, say};
 
 type Rescue = Box<dyn FnOnce(&str) + Send>;
 
@@ -30,7 +32,7 @@ pub fn stepping<T>(kind: &'static str, number: usize, work: impl FnOnce() -> T) 
 /// any function registered before. Other threads keep running meanwhile. If MuJoCo also fails on one of them, that thread
 /// waits until `rescue` has returned.
 pub fn before_fatal_error(rescue: impl FnOnce(&str) + Send + 'static) {
-    *RESCUE.lock().unwrap_or_else(PoisonError::into_inner) = Some(Box::new(rescue));
+    *locked(&RESCUE) = Some(Box::new(rescue));
 }
 
 /// Discards MuJoCo's messages except for fatal errors: no `MUJOCO_LOG.TXT`, and no line per diverged state, which
@@ -52,12 +54,12 @@ fn report_fatal(message: &MjLogMessage) {
         .get()
         .map_or(String::new(), |(kind, number)| format!("{kind} {number}: "));
     let said = format!("{whose}MuJoCo cannot continue: {}", message.subject());
-    let mut rescue = RESCUE.lock().unwrap_or_else(PoisonError::into_inner);
+    let mut rescue = locked(&RESCUE);
     // A panic must not unwind through MuJoCo's frames.
     let _ = catch_unwind(AssertUnwindSafe(|| match rescue.take() {
         Some(rescue) => rescue(&said),
-        None => crate::os::say!("error: {said}"),
+        None => say!("error: {said}"),
     }));
-    crate::os::drain();
-    crate::os::remove_unfinished();
+    drain();
+    remove_unfinished();
 }

@@ -43,27 +43,25 @@ pub fn not_finite(model: &MjModel) -> Result<Option<String>> {
 
 /// The same for the arrays that MuJoCo does not print.
 fn first_in_assets(model: &MjModel) -> Option<String> {
-    let of = |starts: &[i32], at: usize| {
-        starts
-            .iter()
-            .rposition(|&start| start as usize <= at)
-            .unwrap_or_default()
-    };
     let height = model.hfield_data().iter().position(|x| !x.is_finite());
     let height = height.map(|at| {
-        let field = of(model.hfield_adr(), at);
-        ("hfield_data of hfield", mjOBJ_HFIELD, field)
+        (
+            "hfield_data of hfield",
+            mjOBJ_HFIELD,
+            model.hfield_adr(),
+            at,
+        )
     });
     let vertex = model
         .mesh_vert()
         .iter()
         .position(|vertex| !vertex.iter().all(|x| x.is_finite()));
-    let vertex = vertex.map(|at| {
-        let mesh = of(model.mesh_vertadr(), at);
-        ("mesh_vert of mesh", mjOBJ_MESH, mesh)
-    });
-    let (what, kind, id) = height.or(vertex)?;
-    let name = model.id_to_name(kind, id).unwrap_or_default();
+    let vertex = vertex.map(|at| ("mesh_vert of mesh", mjOBJ_MESH, model.mesh_vertadr(), at));
+    let (what, kind, starts, at) = height.or(vertex)?;
+    let id = starts.iter().rposition(|&start| start as usize <= at);
+    let name = model
+        .id_to_name(kind, id.unwrap_or_default())
+        .unwrap_or_default();
     Some(format!("{what} `{}`", shortened(name)))
 }
 

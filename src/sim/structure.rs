@@ -256,17 +256,12 @@ impl Scene {
     /// The number of actuators, joints but free ones, and bodies without a name.
     pub fn unnamed(&self) -> usize {
         let model = &self.model;
-        let parts = [
-            (mjOBJ_ACTUATOR, model.nactuator()),
-            (mjOBJ_JOINT, model.njnt()),
-            (mjOBJ_BODY, model.nbody()),
-        ];
-        let is_unnamed = |kind, id| {
-            let is_free = kind == mjOBJ_JOINT && model.jnt_type()[id] == mjJNT_FREE;
-            !is_free && model.id_to_name(kind, id).is_none_or(str::is_empty)
-        };
-        let count = |(kind, count)| ids(count).filter(|&id| is_unnamed(kind, id)).count();
-        parts.map(count).iter().sum()
+        let joints = ids(model.njnt()).filter(|&joint| model.jnt_type()[joint] != mjJNT_FREE);
+        let mut problems = Problems::new();
+        self.names(mjOBJ_ACTUATOR, ids(model.nactuator()), &mut problems);
+        self.names(mjOBJ_JOINT, joints, &mut problems);
+        self.names(mjOBJ_BODY, ids(model.nbody()), &mut problems);
+        problems.len()
     }
 
     /// The names of all joints that have one.
