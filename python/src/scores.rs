@@ -15,7 +15,7 @@ use pyo3::types::PyBytes;
 use shadow_repose::config::Symmetry;
 use shadow_repose::evaluate::{Actor, Episodes, Trial};
 use shadow_repose::goal_times::GoalTimes;
-use shadow_repose::os::{OutputFile, compressed_for};
+use shadow_repose::os::OutputFile;
 use shadow_repose::play::json_score;
 use shadow_repose::ppo::{Array, Checkpoint};
 use shadow_repose::repose::Score;
@@ -221,8 +221,7 @@ fn played(
         return Ok(Default::default());
     };
     if let Some((file, trace)) = output {
-        let bytes = compressed_for(&file.path, trace.finish().into());
-        file.finish(&bytes)?;
+        file.finish(trace.finish().as_bytes())?;
     }
     let score = Score::of(&played, config.ctrl_dt);
     let warnings = trial.task.warnings.iter().cloned();

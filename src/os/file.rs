@@ -105,15 +105,6 @@ pub fn read_text(path: &Path) -> Result<String> {
     Ok(text)
 }
 
-/// These bytes, compressed by gzip if the name of their file ends in `.gz`.
-pub fn compressed_for(path: &Path, bytes: Vec<u8>) -> Vec<u8> {
-    if path.extension().is_some_and(|extension| extension == "gz") {
-        gzip(&bytes)
-    } else {
-        bytes
-    }
-}
-
 /// Bytes compressed by gzip.
 pub fn gzip(bytes: &[u8]) -> Vec<u8> {
     let mut encoder = GzEncoder::new(Vec::new(), Compression::best());

@@ -22,8 +22,8 @@ mod threads;
 pub use console::colors_enabled;
 pub use destination::Destination;
 pub use file::{
-    Cannot, Stamp, compressed_for, expect_named, gzip, read_bytes, read_text, read_unpacked,
-    same_file, shown, stamp,
+    Cannot, Stamp, expect_named, gzip, read_bytes, read_text, read_unpacked, same_file, shown,
+    stamp,
 };
 pub use folder::Folder;
 pub use interrupt::{Requests, exit_code};

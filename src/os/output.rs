@@ -15,7 +15,7 @@ use std::time::Duration;
 
 use anyhow::{Result, bail, ensure};
 
-use super::file::{Cannot, expect_named, read_bytes};
+use super::file::{Cannot, expect_named, gzip, read_bytes};
 use super::quoted_path;
 use super::threads::locked;
 
@@ -183,12 +183,19 @@ impl OutputFile {
         })
     }
 
-    /// Writes the content and gives the file its final name.
+    /// Writes the content and gives the file its final name. What ends in `.gz` is compressed.
     ///
     /// # Errors
     /// Fails if the file cannot be written.
     pub fn finish(mut self, bytes: &[u8]) -> Result<()> {
-        self.file.write_all(bytes).cannot("write", &self.path)?;
+        let packed = self
+            .path
+            .extension()
+            .is_some_and(|extension| extension == "gz");
+        let packed = packed.then(|| gzip(bytes));
+        self.file
+            .write_all(packed.as_deref().unwrap_or(bytes))
+            .cannot("write", &self.path)?;
         self.complete()
     }
 

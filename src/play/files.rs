@@ -5,7 +5,7 @@ use anyhow::Result;
 use super::plan::Outputs;
 use super::stage::Stage;
 use crate::evaluate::{Episodes, Moment};
-use crate::os::{OutputFile, compressed_for, say};
+use crate::os::{OutputFile, say};
 use crate::see::{About, Replay};
 use crate::trace::Trace;
 
@@ -56,8 +56,7 @@ impl Files {
     /// Fails if one of them cannot be written.
     pub fn finish(self, about: &About) -> Result<()> {
         if let Some((output, trace)) = self.trace {
-            let bytes = compressed_for(&output.path, trace.finish().into());
-            output.finish(&bytes)?;
+            output.finish(trace.finish().as_bytes())?;
         }
         self.page.map_or(Ok(()), |page| page.finish(about))
     }
