@@ -41,8 +41,7 @@ pub fn view(args: &ViewArgs) -> Result<()> {
         .resolve()?;
     if args.check {
         let task = Task::new(&config)?;
-        os::say_line(task.table().trim_end());
-        task.notes().iter().for_each(|note| say!("note: {note}"));
+        describe(&task);
         os::say_line(Check::of(&task, &Config::default().env).table.trim_end());
         return Ok(());
     }
@@ -56,15 +55,8 @@ pub fn view(args: &ViewArgs) -> Result<()> {
         #[cfg(feature = "video")]
         (Some(to), _) => {
             crate::run::expect_output(&to.path, file, config.env.model_file())?;
-            let (_, actor) = &Actor::WITHOUT_POLICY[choice];
-            let [width, height] = see::screenshot(
-                os::OutputFile::create(&to.path)?,
-                &load()?,
-                actor,
-                crate::evaluate::Episodes::scored(args.seed, 1),
-                args.at,
-            )?;
-            say!("{}: {width}x{height}", to.path.display());
+            let output = os::OutputFile::create(&to.path)?;
+            draw(args, output, &load()?, choice)?;
         }
         (None, Some(port)) => show_on_page(args, port, &load()?, choice)?,
         #[cfg(not(feature = "viewer"))]
@@ -72,6 +64,17 @@ pub fn view(args: &ViewArgs) -> Result<()> {
         #[cfg(feature = "viewer")]
         (None, None) => show(&load()?, choice, args.seed)?,
     }
+    Ok(())
+}
+
+/// Draws one picture of the hand in motion.
+#[cfg(feature = "video")]
+fn draw(args: &ViewArgs, to: os::OutputFile, task: &Arc<Task>, choice: usize) -> Result<()> {
+    let (_, actor) = &Actor::WITHOUT_POLICY[choice];
+    let episodes = crate::evaluate::Episodes::scored(args.seed, 1);
+    let path = to.path.clone();
+    let [width, height] = see::screenshot(to, task, actor, episodes, args.at)?;
+    say!("{}: {width}x{height}", path.display());
     Ok(())
 }
 
@@ -96,12 +99,16 @@ fn show(task: &Arc<Task>, choice: usize, seed: u64) -> Result<()> {
 /// Loads the task, and prints what the settings replace in the user's scene.
 fn task_for_display(config: &Config, look: &Look) -> Result<Arc<Task>> {
     let task = Task::new(config)?;
-    let task = see::task_for_display(&task, look)?;
-    if config.env.model_file().is_some() {
+    describe(&task);
+    see::task_for_display(&task, look)
+}
+
+/// Prints what was found in the user's scene, and what the settings replace in it.
+fn describe(task: &Task) {
+    if task.config.model_file().is_some() {
         os::say_line(task.table().trim_end());
     }
     task.notes().iter().for_each(|note| say!("note: {note}"));
-    Ok(task)
 }
 
 /// Shows the scene on a page, with a slider for each actuator, for as long as the program runs.

@@ -56,6 +56,10 @@ float unhidden(sampler2DShadow map, mat4 view, vec3 n, float lift, float wide, f
 
 void main() {
   vec3 base = pow(paint.rgb, vec3(2.2)), back = normalize(eye - place), n = normalize(facing);
+  // At a sharp edge of a mesh, its normals are means of faces.
+  vec3 facet = normalize(cross(dFdx(place), dFdy(place)));
+  facet *= sign(dot(facet, back));
+  if (dot(n, facet) < .8) n = facet;
   float alpha = paint.a;
   if (isFloor) {
     vec2 cell = place.xy / (.35 * reach), edge = max(fwidth(cell), vec2(1e-4));

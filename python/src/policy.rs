@@ -171,7 +171,10 @@ impl Policy {
     /// `[A]`: the standard deviation of each action.
     #[getter]
     fn std<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f32>> {
-        self.loaded.policy.stds().into_pyarray(py)
+        let logs = self.loaded.policy.log_std.iter();
+        logs.map(|log| log.exp())
+            .collect::<Vec<f32>>()
+            .into_pyarray(py)
     }
 
     /// Its file.

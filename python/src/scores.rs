@@ -75,8 +75,7 @@ pub(crate) fn file_of<'py>(
         ("mean", mean),
         ("variance", variance),
         ("count", vec![SEEN]),
-        ("epsilon", vec![epsilon]),
-        ("clip", vec![clip]),
+        ("constants", vec![epsilon, clip]),
     ] {
         let numbers = Array::F64(vec![numbers.len()], numbers);
         checkpoint.insert(&format!("normalizer.{name}"), numbers);

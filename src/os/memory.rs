@@ -2,11 +2,8 @@
 
 use std::fs;
 
-/// Where Linux says how much memory the processes of this container may use.
-const LIMITS: [&str; 2] = [
-    "/sys/fs/cgroup/memory.max",
-    "/sys/fs/cgroup/memory/memory.limit_in_bytes",
-];
+/// How much memory the processes of this container may use.
+const LIMIT: &str = "/sys/fs/cgroup/memory.max";
 
 /// The number in kB behind `name` in a file of such lines, in bytes.
 fn reported(path: &str, name: &str) -> Option<f64> {
@@ -25,11 +22,8 @@ pub fn used() -> Option<f64> {
 /// The memory that all processes of the machine may use, or of this container, bytes. `None` on other systems.
 pub fn of_machine() -> Option<f64> {
     let all = reported("/proc/meminfo", "MemTotal:")?;
-    let limits = LIMITS.iter().filter_map(|path| {
-        let text = fs::read_to_string(path).ok()?;
-        text.trim().parse().ok()
-    });
-    Some(limits.fold(all, f64::min))
+    let limit = fs::read_to_string(LIMIT).unwrap_or_default();
+    Some(limit.trim().parse().map_or(all, |limit| all.min(limit)))
 }
 
 #[cfg(test)]

@@ -115,7 +115,7 @@ fn sliders(stage: &Stage) -> Sliders {
     let env = &stage.task.config;
     let mut sliders: Vec<Slider> = FACTORS
         .into_iter()
-        .map(|(quantity, name, range)| Slider::new(name, range, 0.0, 1.0).of_quantity(quantity))
+        .map(|(quantity, name, range)| Slider::new(name, range, 0.0, 1.0, Some(quantity)))
         .collect();
     let starts = [
         env.cube_size_scale,
@@ -124,7 +124,7 @@ fn sliders(stage: &Stage) -> Sliders {
     ];
     for ((_, name, [low, high], step), start) in SETTINGS.into_iter().zip(starts) {
         let range = [low.min(start), high.max(start)];
-        sliders.push(Slider::new(name, range, step, start));
+        sliders.push(Slider::new(name, range, step, start, None));
     }
     if stage.policy.is_some() {
         let drawn = stage.choice as f64;
@@ -133,6 +133,7 @@ fn sliders(stage: &Stage) -> Sliders {
             [0.0, 1.0],
             1.0,
             drawn,
+            None,
         ));
     }
     Sliders::new(sliders, true)
@@ -151,6 +152,15 @@ fn changed(usual: &[f64], values: &[f64]) -> Vec<Override> {
             value: value.to_string(),
         })
         .collect()
+}
+
+/// Where the policy of each further episode comes from, or the name of an actor.
+fn place_of(stage: &Stage, followed: Option<&Followed>) -> PathBuf {
+    match (followed, &stage.policy) {
+        (Some(followed), _) => followed.path.clone(),
+        (None, Some(policy)) => policy.origin.path().to_owned(),
+        (None, None) => stage.actor().name().into(),
+    }
 }
 
 /// Shows the hand on a page for as long as the program runs. If a run is `followed`, each episode uses its newest policy. The page can
@@ -176,11 +186,7 @@ pub fn live(
         about.title = followed.run.place().display().to_string();
         about.policy = None;
     }
-    let path = match (&followed, &stage.policy) {
-        (Some(followed), _) => followed.path.clone(),
-        (None, Some(policy)) => policy.origin.path().to_owned(),
-        (None, None) => stage.actor().name().into(),
-    };
+    let path = place_of(&stage, followed.as_ref());
     let stage = Rc::new(stage);
     let mut acting = stage.clone().acting(task.clone(), draws.clone());
     let look = (&about, shot.camera);

@@ -31,11 +31,8 @@ const LOG_STD: &str = "log_std";
 /// The beginning of the names of the critic's tensors. The policy of another program has none.
 const CRITIC: &str = "critic.";
 
-/// The name of what is added to variances, in a file where it is not [`EPSILON`].
-const EPSILON_NAME: &str = "normalizer.epsilon";
-
-/// The name of the limit of normalised values, in a file where it is not [`CLIP`].
-const CLIP_NAME: &str = "normalizer.clip";
+/// The name of what is added to variances and of the limit of normalised values, in a file where they are not [`EPSILON`] and [`CLIP`].
+const CONSTANTS: &str = "normalizer.constants";
 
 /// A checkpoint, or a policy alone, independent of a learner.
 #[derive(Clone, Default)]
@@ -235,12 +232,10 @@ impl Checkpoint {
         let count = self.take_vector("normalizer.count", 1)?[0];
         let mean = self.take_vector("normalizer.mean", size)?;
         let variance = self.take_vector("normalizer.variance", size)?;
-        let mut own = |name: &str, usual| match self.shape(name) {
-            Some(_) => Ok(self.take_vector(name, 1)?[0]),
-            None => anyhow::Ok(usual),
+        let [epsilon, clip] = match self.shape(CONSTANTS) {
+            Some(_) => *self.take_vector(CONSTANTS, 2)?.first_chunk().expect("two"),
+            None => [EPSILON, CLIP],
         };
-        let epsilon = own(EPSILON_NAME, EPSILON)?;
-        let clip = own(CLIP_NAME, CLIP)?;
         ensure!(
             mean.iter()
                 .chain(&variance)
@@ -254,7 +249,7 @@ impl Checkpoint {
         );
         ensure!(
             epsilon >= 0.0 && clip > 0.0 && variance.iter().all(|&v| v + epsilon > 0.0),
-            "tensor `{EPSILON_NAME}` or `{CLIP_NAME}` has a value that nothing can be divided or clipped by"
+            "tensor `{CONSTANTS}` has a value that nothing can be divided or clipped by"
         );
         policy.normalizer = Normalizer {
             mean,
@@ -320,13 +315,9 @@ impl Ppo {
         checkpoint.insert("normalizer.mean", vector(&normalizer.mean));
         checkpoint.insert("normalizer.variance", vector(&normalizer.variance));
         checkpoint.insert("normalizer.count", vector(&[normalizer.count]));
-        for (name, value, usual) in [
-            (EPSILON_NAME, normalizer.epsilon, EPSILON),
-            (CLIP_NAME, normalizer.clip, CLIP),
-        ] {
-            if value != usual {
-                checkpoint.insert(name, vector(&[value]));
-            }
+        let constants = [normalizer.epsilon, normalizer.clip];
+        if constants != [EPSILON, CLIP] {
+            checkpoint.insert(CONSTANTS, vector(&constants));
         }
     }
 
@@ -542,7 +533,7 @@ mod tests {
             refused.contains("`adam.square.actor.1.bias` has a negative value"),
             "{refused}"
         );
-        negative.insert(CLIP_NAME, Array::F64(vec![1], vec![0.0]));
+        negative.insert(CONSTANTS, Array::F64(vec![2], vec![0.0, 0.0]));
         let refused = refusal(negative, &mut learner(&[8]));
         assert!(refused.contains("nothing can be divided"), "{refused}");
     }

@@ -95,11 +95,6 @@ impl Policy {
         self.log_std[0].exp()
     }
 
-    /// `[A]`: the standard deviation of each action.
-    pub fn stds(&self) -> Vec<f32> {
-        self.log_std.iter().map(|log| log.exp()).collect()
-    }
-
     /// Adds the raw rows of these arrays `[B, O]` on all ranks to the normaliser.
     pub(super) fn see(&mut self, arrays: &[&[f32]], exchange: &Exchange) {
         let perception = self.perception();

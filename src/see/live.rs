@@ -370,7 +370,7 @@ mod tests {
             policy: None,
             seed: None,
         };
-        let mass = Slider::new("mass", [0.1, 3.0], 0.0, 1.0).of_quantity("cube_mass");
+        let mass = Slider::new("mass", [0.1, 3.0], 0.0, 1.0, Some("cube_mass"));
         let sliders = Sliders::new(vec![mass], true);
         let post = sliders.on_post();
         let open = |sliders: &Sliders| {

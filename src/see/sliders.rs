@@ -71,23 +71,20 @@ enum Said {
 
 impl Slider {
     /// Creates a slider that has not moved.
-    pub fn new(name: &str, range: [f64; 2], step: f64, start: f64) -> Self {
+    pub fn new(
+        name: &str,
+        range: [f64; 2],
+        step: f64,
+        start: f64,
+        quantity: Option<&'static str>,
+    ) -> Self {
         Self {
             name: name.into(),
             range,
             step,
             start,
-            quantity: None,
+            quantity,
             value: None,
-        }
-    }
-
-    /// The same slider as a factor on a quantity of the physics.
-    #[must_use]
-    pub fn of_quantity(self, quantity: &'static str) -> Self {
-        Self {
-            quantity: Some(quantity),
-            ..self
         }
     }
 
@@ -114,7 +111,7 @@ impl Sliders {
         let actuators = hand.parts.actuators.iter().zip(&hand.actuators);
         let sliders = actuators.map(|(name, actuator)| {
             let [low, high] = actuator.range;
-            Slider::new(name, actuator.range, 0.0, f64::midpoint(low, high))
+            Slider::new(name, actuator.range, 0.0, f64::midpoint(low, high), None)
         });
         Self::new(sliders.collect(), false)
     }
@@ -245,7 +242,10 @@ mod tests {
     #[test]
     fn a_page_pushes_and_presses_only_where_it_may() {
         let forbidden = Sliders::new(Vec::new(), false).on_post();
-        let sliders = Sliders::new(vec![Slider::new("friction", [0.5, 2.0], 0.0, 1.0)], true);
+        let sliders = Sliders::new(
+            vec![Slider::new("friction", [0.5, 2.0], 0.0, 1.0, None)],
+            true,
+        );
         let post = sliders.on_post();
         let bodies = ["\"goal\"", "{\"push\":[1,[0.5,0,-1]]}"];
         for body in bodies {

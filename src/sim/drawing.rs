@@ -9,7 +9,6 @@ use super::Scene;
 use super::constants::*;
 use super::look::{Camera, HIDDEN, is_of};
 use crate::draw::Mesh;
-use crate::quat;
 
 /// A scene as a page draws it. Lengths in m, quaternions w, x, y, z.
 pub struct Drawing {
@@ -27,9 +26,6 @@ pub struct Drawing {
 
 /// The most corners of a part of a mesh, which a page numbers in 16 bits.
 const MOST_CORNERS: usize = 65_535;
-
-/// The cosine of the angle between a face and the normal at its corner above which the edge is round.
-const SHARP: f64 = 0.8;
 
 /// The colour of a shape that has none.
 const UNCOLOURED: [f32; 4] = [0.5, 0.5, 0.5, 1.0];
@@ -202,17 +198,9 @@ fn drawn_mesh(model: &MjModel, mesh: usize) -> Vec<Mesh> {
             places.clear();
         }
         let (corners, triangles) = parts.last_mut().expect("there is a first part");
-        let flat = normal_of(face.map(|corner| model.mesh_vert()[(points + corner) as usize]));
         triangles.push([0, 1, 2].map(|corner| {
             let point = model.mesh_vert()[(points + face[corner]) as usize];
-            let mean = model.mesh_normal()[(normals + directions[corner]) as usize];
-            // Of a sharp edge, MuJoCo has the mean of the faces.
-            let along: f64 = (0..3).map(|axis| f64::from(mean[axis]) * flat[axis]).sum();
-            let normal = if along < SHARP {
-                flat.map(|x| x as f32)
-            } else {
-                mean
-            };
+            let normal = model.mesh_normal()[(normals + directions[corner]) as usize];
             // Points of one place and direction, as a picture shows them, are one corner.
             let key = (
                 point.map(|x| (x * 5e4).round() as i64),
@@ -228,18 +216,6 @@ fn drawn_mesh(model: &MjModel, mesh: usize) -> Vec<Mesh> {
         triangles.retain(|[a, b, c]| a != b && b != c && a != c);
     }
     parts
-}
-
-/// The direction of a triangle with these corners, or zero if it has none.
-fn normal_of([a, b, c]: [[f32; 3]; 3]) -> [f64; 3] {
-    let [u, v] = [b, c].map(|end| [0, 1, 2].map(|axis| f64::from(end[axis] - a[axis])));
-    let normal = [
-        u[1] * v[2] - u[2] * v[1],
-        u[2] * v[0] - u[0] * v[2],
-        u[0] * v[1] - u[1] * v[0],
-    ];
-    let length = quat::length(&normal).max(f64::MIN_POSITIVE);
-    normal.map(|x| x / length)
 }
 
 fn camera(model: &MjModel, from: Option<Camera>) -> Value {
