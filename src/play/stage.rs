@@ -118,7 +118,10 @@ impl Stage {
         LiveActor {
             policy: self.described(),
             step: Rc::new(move |player: &mut Player| {
-                let choice = self.choice.max(usize::from(draws()));
+                let choice = match self.policy {
+                    Some(_) => usize::from(draws()),
+                    None => self.choice,
+                };
                 let (_, actor) = &self.actors_of(Policy::freeze_briefly)[choice];
                 player.step(actor)
             }),
