@@ -196,8 +196,10 @@ impl Dense<'_> {
     /// A copy of the weight, transposed.
     fn transposed(&self) -> Vec<f32> {
         let data = self.weight.data();
-        let columns = (0..self.inputs).flat_map(|input| data[input..].iter().step_by(self.inputs));
-        columns.copied().collect()
+        let mut weight_t = Vec::with_capacity(data.len());
+        (0..self.inputs)
+            .for_each(|input| weight_t.extend(data[input..].iter().step_by(self.inputs)));
+        weight_t
     }
 
     /// The transposed weight, for a product with `rows` rows.
