@@ -40,10 +40,7 @@ pub fn view(args: &ViewArgs) -> Result<()> {
         .sets(&args.settings.set)
         .resolve()?;
     if args.check {
-        let task = Task::new(&config)?;
-        describe(&task);
-        os::say_line(Check::of(&task, &Config::default().env).table.trim_end());
-        return Ok(());
+        return check(&config);
     }
     let choice =
         Actor::without_policy(Path::new(&args.actions)).context("an actor for each motion")?;
@@ -75,6 +72,14 @@ fn draw(args: &ViewArgs, to: os::OutputFile, task: &Arc<Task>, choice: usize) ->
     let path = to.path.clone();
     let [width, height] = see::screenshot(to, task, actor, episodes, args.at)?;
     say!("{}: {width}x{height}", path.display());
+    Ok(())
+}
+
+/// Prints whether the hand can learn.
+fn check(config: &Config) -> Result<()> {
+    let task = Task::new(config)?;
+    describe(&task);
+    os::say_line(Check::of(&task, &Config::default().env).table.trim_end());
     Ok(())
 }
 

@@ -14,7 +14,7 @@ use crate::load::PolicySource;
 use crate::os::{self, Destination, Place, Stamp, say};
 use crate::repose::Task;
 use crate::run::{self, RunFolder};
-use crate::see::{self, About, Live, Replay, Slider, Sliders};
+use crate::see::{self, About, Live, LiveActor, Replay, Slider, Sliders};
 use crate::sim::Look;
 
 /// The most bytes of a line of a trace. A step of the Shadow Hand has 5000.
@@ -127,12 +127,11 @@ fn sliders(stage: &Stage) -> Sliders {
         sliders.push(Slider::new(name, range, step, start, None));
     }
     if stage.policy.is_some() {
-        let drawn = stage.choice as f64;
         sliders.push(Slider::new(
             "0: mean actions, 1: actions with noise",
             [0.0, 1.0],
             1.0,
-            drawn,
+            stage.choice as f64,
             None,
         ));
     }
@@ -163,6 +162,37 @@ fn place_of(stage: &Stage, followed: Option<&Followed>) -> PathBuf {
     }
 }
 
+/// The policy at `path` in a task with these settings, for a page that began with a stage and the task on display.
+///
+/// # Errors
+/// Fails as [`Stage::find`] does, or if the policy is for another hand.
+fn another(
+    path: &Path,
+    sets: &[Override],
+    (first, task, shot): (&Stage, &Task, &Look),
+    sliders: &Sliders,
+) -> Result<LiveActor> {
+    let newer = Stage {
+        choice: first.choice,
+        ..Stage::find(Some(path), sets)?
+    };
+    let record = |stage: &Stage| stage.policy.as_ref().map(|policy| policy.record.clone());
+    ensure!(
+        record(&newer) == record(first),
+        "{} is for another hand",
+        path.display()
+    );
+    let shown = see::task_for_display(&newer.task, shot)?;
+    let mut acting = Rc::new(newer).acting(shown, sliders.clone());
+    // The page shows the settings of the first policy.
+    for (key, value) in acting.task.config.unlike(&task.config) {
+        if let Some(name) = &mut acting.policy {
+            *name += &format!(", {key} {}", short(&value));
+        }
+    }
+    Ok(acting)
+}
+
 /// Shows the hand on a page for as long as the program runs. If a run is `followed`, each episode uses its newest policy. The page can
 /// push the object, and change the world.
 ///
@@ -177,9 +207,6 @@ pub fn live(
 ) -> Result<ExitCode> {
     let sliders = sliders(&stage);
     let usual = sliders.values();
-    let own = sliders.clone();
-    let draws: Rc<dyn Fn() -> bool> =
-        Rc::new(move || own.values().get(FACTORS.len() + SETTINGS.len()) == Some(&1.0));
     let task = see::task_for_display(&stage.task, shot)?;
     let mut about = about(&stage, seed);
     if let Some(followed) = &followed {
@@ -188,35 +215,19 @@ pub fn live(
     }
     let path = place_of(&stage, followed.as_ref());
     let stage = Rc::new(stage);
-    let mut acting = stage.clone().acting(task.clone(), draws.clone());
+    let mut acting = stage.clone().acting(task.clone(), sliders.clone());
     let look = (&about, shot.camera);
     let live = Live::open(place, look, hands as usize, &acting, sliders.clone())?;
-    let load = |sets: &[Override]| {
-        let newer = Stage {
-            choice: stage.choice,
-            ..Stage::find(Some(&path), &[set, sets].concat())?
-        };
-        let record = |stage: &Stage| stage.policy.as_ref().map(|policy| policy.record.clone());
-        ensure!(
-            record(&newer) == record(&stage),
-            "{} is for another hand",
-            path.display()
-        );
-        let shown = see::task_for_display(&newer.task, shot)?;
-        let mut acting = Rc::new(newer).acting(shown, draws.clone());
-        // The page shows the settings of the first policy.
-        for (key, value) in acting.task.config.unlike(&task.config) {
-            if let Some(name) = &mut acting.policy {
-                *name += &format!(", {key} {}", short(&value));
-            }
-        }
-        Ok(acting)
-    };
     let mut known = Vec::new();
     live.show(&mut || {
         let sets = changed(&usual, &sliders.values());
         if followed.as_mut().is_some_and(Followed::has_changed) || sets != known {
-            match load(&sets) {
+            match another(
+                &path,
+                &[set, &sets].concat(),
+                (&stage, &task, shot),
+                &sliders,
+            ) {
                 Ok(newer) => acting = newer,
                 Err(error) => say!("warning: {error:#}\n  The previous one continues."),
             }

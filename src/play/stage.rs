@@ -14,7 +14,7 @@ use crate::os::{self, Destination, say};
 use crate::ppo::{FrozenPolicy, Policy};
 use crate::repose::Task;
 use crate::run;
-use crate::see::LiveActor;
+use crate::see::{LiveActor, Sliders};
 
 /// Who acts, and the task.
 pub struct Stage {
@@ -113,13 +113,13 @@ impl Stage {
         Some(with_warnings(&self.policy.as_ref()?.name, warnings))
     }
 
-    /// The actor of a page that shows this task. Its actions are drawn if `draws` says so, or as the user has chosen.
-    pub fn acting(self: Rc<Self>, task: Arc<Task>, draws: Rc<dyn Fn() -> bool>) -> LiveActor {
+    /// The actor of a page that shows this task. The last of its sliders says whether the actions of a policy are drawn.
+    pub fn acting(self: Rc<Self>, task: Arc<Task>, sliders: Sliders) -> LiveActor {
         LiveActor {
             policy: self.described(),
             step: Rc::new(move |player: &mut Player| {
                 let choice = match self.policy {
-                    Some(_) => usize::from(draws()),
+                    Some(_) => usize::from(sliders.values().last() == Some(&1.0)),
                     None => self.choice,
                 };
                 let (_, actor) = &self.actors_of(Policy::freeze_briefly)[choice];

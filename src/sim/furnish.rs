@@ -183,9 +183,9 @@ fn marks(model: &MjModel, body: usize) -> Option<Vec<Mark>> {
         };
         (kind, size, position, orientation)
     };
-    let is_plain = |&(geom, _): &(usize, Placed)| model.geom_matid()[geom] < 0;
-    let all = shapes.iter().all(is_plain);
-    all.then(|| (0..FACES.len()).map(mark).collect())
+    let mut shapes = shapes.iter();
+    let is_plain = shapes.all(|&(geom, _)| model.geom_matid()[geom] < 0);
+    is_plain.then(|| (0..FACES.len()).map(mark).collect())
 }
 
 /// The corners of a box along the axes around shapes that have these places, m.
