@@ -173,7 +173,10 @@ class Policy:
         return policy
 
     def save(self, file: str | os.PathLike[str]) -> None:
-        """Writes the policy to a file, which `play --ckpt`, `export` and `Policy.load` take. A policy has no optimizer to resume with."""
+        """Writes the policy to a file, which `play --ckpt`, `export` and `Policy.load` take.
+
+        The file holds the settings that it was trained with, not those of `Policy.load(…, set=…)`, and no optimizer to resume with.
+        """
         with open(file, "wb") as output:
             output.write(self._native.content())
 

@@ -383,6 +383,37 @@ mod tests {
     use super::*;
 
     #[test]
+    fn what_is_only_seen_is_left_out_unless_the_motion_would_be_another() {
+        let part = "<mesh name='part' vertex='0 0 0 .05 0 0 0 .03 0 0 0 .02 .05 .03 .01'/>";
+        let unseen = "contype='0' conaffinity='0'";
+        let seen = format!("<geom name='seen' type='mesh' mesh='part' mass='.2' {unseen}/>");
+        let wrap = "<tendon><spatial><site site='a'/><geom geom='drum'/><site site='b'/></spatial></tendon>";
+        for (tendon, geoms) in [("", 1), (wrap, 3)] {
+            let text = format!(
+                "<mujoco><asset>{part}</asset><worldbody><site name='a' pos='.1 0 0'/><body name='cube'><freejoint/>{seen}
+                 <geom name='drum' type='cylinder' size='.01 .01' {unseen}/><geom type='box' size='.02 .03 .04'/>
+                 <site name='b' pos='-.1 0 0'/></body></worldbody>{tendon}</mujoco>"
+            );
+            let mut file = tempfile::NamedTempFile::with_suffix(".xml").unwrap();
+            file.write_all(text.as_bytes()).unwrap();
+            let [whole, light] = [false, true].map(|physics_only| {
+                let plain = Compilation::plain(0.01, Cone::Scene);
+                let own = Compilation {
+                    physics_only,
+                    ..plain
+                };
+                own.compile(Some(file.path())).unwrap()
+            });
+            assert_eq!(whole.ngeom(), 3);
+            assert_eq!(light.ngeom(), geoms, "{tendon}");
+            assert!(
+                whole.body_mass() == light.body_mass()
+                    && whole.body_inertia() == light.body_inertia()
+            );
+        }
+    }
+
+    #[test]
     fn a_goal_that_is_added_has_the_shapes_of_the_object_in_their_places() {
         let box_in = |more: &str| format!("<geom type='box' size='.02 .03 .04' {more}/>");
         for (size, shapes) in [
