@@ -193,7 +193,7 @@ impl Scene {
         self.model.body_subtreemass()[id]
     }
 
-    /// A checksum of everything that changes its motion. See [`fingerprint`].
+    /// A checksum of everything that changes its motion.
     pub fn fingerprint(&self) -> String {
         fingerprint(&self.model)
     }
