@@ -3,7 +3,7 @@
 
 use std::collections::{BTreeSet, HashSet};
 use std::iter;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use anyhow::{Result, bail, ensure};
 
@@ -51,7 +51,8 @@ struct RunTable {
 /// Fails if no run has readable metrics with at least one row, if none has a requested column, or if the picture cannot be written.
 pub fn plot(args: &PlotArgs) -> Result<()> {
     // Opened before anything is read, so that a path that cannot be written to is reported at once.
-    let tables = args.runs.iter().map(|place| run::table_of(place));
+    let places = args.runs.iter().chain(&args.behind);
+    let tables = places.map(|place| run::table_of(place));
     run::expect_output(&args.out.path, tables, None)?;
     let output = PictureFile::create(&args.out)?;
     let mut metrics: Vec<Metric> = args.metric.iter().map(|name| (&name[..], None)).collect();
@@ -62,7 +63,8 @@ pub fn plot(args: &PlotArgs) -> Result<()> {
         .iter()
         .flat_map(|(usual, other)| iter::chain([*usual], *other))
         .collect();
-    let runs = runs(args, &wanted)?;
+    let behind = runs(&args.behind, args.along, &wanted)?;
+    let runs = runs(&args.runs, args.along, &wanted)?;
     expect_columns(&runs, &args.metric)?;
     ensure!(
         !args.seeds || runs.len() > 1,
@@ -83,7 +85,13 @@ pub fn plot(args: &PlotArgs) -> Result<()> {
     let window = window(&runs, args.smooth);
     let panels = metrics
         .into_iter()
-        .map(|metric| panel(known_name(metric, &runs), &runs, window, args.seeds))
+        .map(|metric| {
+            let name = known_name(metric, &runs);
+            Subplot {
+                behind: behind.iter().map(|run| run.curve(name, window)).collect(),
+                ..panel(name, &runs, window, args.seeds)
+            }
+        })
         .collect();
     Chart {
         legend,
@@ -122,6 +130,7 @@ fn panel(name: &str, runs: &[RunTable], window: f64, seeds: bool) -> Subplot {
     Subplot {
         title,
         curves,
+        behind: Vec::new(),
         nothing: if name.starts_with(EVALUATION) {
             "no evaluation yet"
         } else {
@@ -134,17 +143,17 @@ fn panel(name: &str, runs: &[RunTable], window: f64, seeds: bool) -> Subplot {
 ///
 /// # Errors
 /// Fails if none of them can be drawn.
-fn runs(args: &PlotArgs, wanted: &[&str]) -> Result<Vec<RunTable>> {
+fn runs(places: &[PathBuf], along: Along, wanted: &[&str]) -> Result<Vec<RunTable>> {
     let mut runs = Vec::new();
     let mut known = HashSet::new();
-    for (i, place) in args.runs.iter().enumerate() {
+    for (i, place) in places.iter().enumerate() {
         let whole = run::table_of(place).canonicalize();
         if whole.is_ok_and(|whole| !known.insert(whole)) {
             continue;
         }
-        match RunTable::read(place, args.along, wanted) {
+        match RunTable::read(place, along, wanted) {
             Ok(run) => runs.push(run),
-            Err(error) if runs.is_empty() && i + 1 == args.runs.len() => return Err(error),
+            Err(error) if runs.is_empty() && i + 1 == places.len() => return Err(error),
             Err(error) => say!("warning: {error:#}; skipped"),
         }
     }

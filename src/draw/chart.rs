@@ -1,5 +1,7 @@
 //! A chart with curves in panels, one above the other, and a legend above them: SVG, or PNG with the feature `video`.
 
+use std::iter;
+
 use anyhow::{Context, Result, bail, ensure};
 use plotters::coord::Shift;
 use plotters::coord::types::RangedCoordf64;
@@ -15,6 +17,8 @@ pub struct Subplot {
     pub title: String,
     /// Curves, at the places of their names in the legend.
     pub curves: Vec<Curve>,
+    /// Curves without names. They are grey and lie behind the others.
+    pub behind: Vec<Curve>,
     /// The word that is shown if no curve has a point.
     pub nothing: &'static str,
 }
@@ -45,6 +49,9 @@ pub struct Chart {
 /// The colour of the grid. Opaque, since not every SVG viewer supports opacity.
 pub const GRID: RGBColor = RGBColor(225, 225, 225);
 
+/// The colour of curves without names.
+const BEHIND: RGBColor = RGBColor(180, 180, 180);
+
 /// Colours of the curves, distinguishable with red-green colour blindness: M. Okabe, K. Ito, "Color universal design" (2008).
 pub const COLOURS: [RGBColor; 7] = [
     RGBColor(0, 114, 178),
@@ -64,7 +71,7 @@ const GAP: i32 = 3;
 
 /// The colour and dash length (pixels) of each curve in turn. Once all colours are used, they repeat with dashes.
 fn styles() -> impl Iterator<Item = (ShapeStyle, i32)> {
-    let dashes = std::iter::once(i32::MAX).chain((1..).map(|round| 5 * round));
+    let dashes = iter::once(i32::MAX).chain((1..).map(|round| 5 * round));
     dashes.flat_map(|dash| {
         COLOURS
             .iter()
@@ -205,7 +212,7 @@ impl Picture for Chart {
                 )?;
             }
         }
-        let curves = self.panels.iter().flat_map(|panel| &panel.curves);
+        let curves = self.panels.iter().flat_map(Subplot::all);
         let x = range(curves.flat_map(Curve::along));
         let count = self.panels.len();
         let parts = below.split_evenly((count, 1));
@@ -272,6 +279,11 @@ fn legend_height(rows: &[LegendRow]) -> u32 {
 }
 
 impl Subplot {
+    /// All curves, in the order in which they are drawn.
+    fn all(&self) -> impl Iterator<Item = &Curve> {
+        self.behind.iter().chain(&self.curves)
+    }
+
     /// Draws the panel into `part`, with a label of the x axis if it is the last.
     fn draw(
         &self,
@@ -279,7 +291,7 @@ impl Subplot {
         x: std::ops::Range<f64>,
         along: Option<&str>,
     ) -> Result<()> {
-        let y = range(self.curves.iter().flat_map(Curve::values));
+        let y = range(self.all().flat_map(Curve::values));
         let extent = y.end - y.start;
         let mut chart = ChartBuilder::on(part)
             .caption(printable(&self.title), ("sans-serif", 17))
@@ -305,10 +317,11 @@ impl Subplot {
             mesh.x_desc(along);
         }
         mesh.draw()?;
-        for (curve, style) in self.curves.iter().zip(styles()) {
+        let unnamed = iter::repeat_n((BEHIND.stroke_width(2), i32::MAX), self.behind.len());
+        for (curve, style) in self.all().zip(unnamed.chain(styles())) {
             curve.draw(&mut chart, style)?;
         }
-        if self.curves.iter().all(|curve| curve.points.is_empty()) {
+        if self.all().all(|curve| curve.points.is_empty()) {
             let (width, height) = part.dim_in_pixel();
             draw_text(
                 part,
@@ -382,6 +395,7 @@ mod tests {
         Subplot {
             title: title.into(),
             curves,
+            behind: Vec::new(),
             nothing: "nothing yet",
         }
     }

@@ -772,6 +772,16 @@ fn learning_curves_are_drawn_of_any_columns_and_runs() {
         svg.contains("value loss (1 of 2 seeds)") && !svg.contains("nothing yet"),
         "{svg}"
     );
+    // A run behind the others is grey and not in the legend.
+    succeeded(program(
+        folder.path(),
+        &["plot", "run", "--behind", "other/metrics.csv"],
+    ));
+    let svg = fs::read_to_string(folder.path().join("learning.svg")).unwrap();
+    assert!(
+        svg.contains("#B4B4B4") && svg.contains("\nrun\n") && !svg.contains("\nother\n"),
+        "{svg}"
+    );
     let refused = program(folder.path(), &["plot", "run", "--seeds"]);
     assert!(
         stderr(&refused).contains("error: --seeds"),
