@@ -27,8 +27,8 @@ pub struct PlotArgs {
     /// tenth of the shortest run, at most 50]
     #[arg(long, value_name = "N", value_parser = count())]
     pub smooth: Option<usize>,
-    /// Run, or table, to draw in grey and without its name, behind the others; repeatable
-    #[arg(long, value_name = "RUN")]
+    /// Runs, or tables, to draw in grey and without their names, behind the others
+    #[arg(long, value_name = "RUN", num_args = 1..)]
     pub behind: Vec<PathBuf>,
     /// Draw the mean of all runs (seeds of one setting), with a band from the lowest to the highest
     #[arg(long)]
