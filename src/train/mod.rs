@@ -164,10 +164,9 @@ impl Session {
             };
             let traffic = self.agent.exchange.take_traffic();
             let due = evaluates(self.agent.iteration, self.config.run.eval_every);
-            let Some(evaluation) = self.evaluate(due, &now, duties)? else {
+            let Some((evaluation, improved)) = self.evaluate(due, &now, duties)? else {
                 return Ok(None);
             };
-            let improved = self.take_down(&evaluation);
             let (ended, steps) = self.take_results();
             Ok(Some(Outcome {
                 iteration,
@@ -224,7 +223,7 @@ impl Session {
     fn begin(&mut self, requests: &Requests, duties: &mut dyn Duties) -> Result<bool> {
         if self.config.run.patience > 0 && self.rise.is_none() {
             let now = self.requests_now(requests);
-            let Some(before) = caught(|| self.evaluate(true, &now, duties))? else {
+            let Some(before) = caught(|| self.score(CONFIRMATION, &now, duties))? else {
                 return Ok(false);
             };
             let known = figures(&before);
@@ -232,7 +231,7 @@ impl Session {
                 known.iter().all(|x| x.is_finite()),
                 "run.patience: the physics of every evaluation episode diverges at once"
             );
-            self.take_down(&before);
+            self.best = Some(rank(&before));
             self.rise = Some(Rise {
                 before: known,
                 best: known,
@@ -243,43 +242,58 @@ impl Session {
         Ok(true)
     }
 
-    /// Records an evaluation, if the score is one, and returns whether it is the best so far.
-    fn take_down(&mut self, evaluation: &Score) -> bool {
-        let found = [evaluation["goals"], evaluation["rot_dist"]];
-        let improved = beats(found, self.best);
-        if improved {
-            self.best = Some(found);
-        }
-        // While the critic learns alone, an evaluation cannot rise.
-        if evaluation.episodes > 0
-            && !self.agent.ppo.is_critic_alone(self.agent.iteration)
-            && let Some(rise) = &mut self.rise
-        {
-            rise.add(figures(evaluation));
-        }
-        improved
-    }
-
-    /// Plays the evaluation episodes, if they are `due`, and shows their score. Returns `None` if a stop was requested meanwhile.
+    /// Evaluates, if that is `due`. Returns the score, which has no episodes if it is not, and whether this is the best policy so far.
+    /// Returns `None` if a stop was requested meanwhile.
+    ///
+    /// A policy whose score is the best so far was perhaps lucky. It is the best only if its score in other episodes confirms that.
     fn evaluate(
-        &self,
+        &mut self,
         due: bool,
         requests: &Requests,
         duties: &mut dyn Duties,
-    ) -> Result<Option<Score>> {
-        let ctrl_dt = self.task.config.ctrl_dt;
+    ) -> Result<Option<(Score, bool)>> {
         if !due {
-            return Ok(Some(Score::of(&[], ctrl_dt)));
+            return Ok(Some((Score::of(&[], self.task.config.ctrl_dt), false)));
         }
+        let Some(score) = self.score(EVALUATION, requests, duties)? else {
+            return Ok(None);
+        };
+        let mut judged = score;
+        if beats(rank(&score), self.best) {
+            let Some(confirmation) = self.score(CONFIRMATION, requests, duties)? else {
+                return Ok(None);
+            };
+            judged = confirmation;
+        }
+        let improved = judged.episodes > score.episodes && beats(rank(&judged), self.best);
+        if improved {
+            self.best = Some(rank(&judged));
+        }
+        // While the critic learns alone, an evaluation cannot rise.
+        if !self.agent.ppo.is_critic_alone(self.agent.iteration)
+            && let Some(rise) = &mut self.rise
+        {
+            rise.add(figures(&judged));
+        }
+        Ok(Some((score, improved)))
+    }
+
+    /// Plays these of the evaluation episodes, and shows their score. Returns `None` if a stop was requested meanwhile.
+    fn score(
+        &self,
+        (purpose, times): (&'static str, usize),
+        requests: &Requests,
+        duties: &mut dyn Duties,
+    ) -> Result<Option<Score>> {
         let task = self
             .task
             .at_the_stage_of(&self.config.env.at(self.agent.env_steps));
         let run = &self.config.run;
         let episodes = Episodes {
             seed: run.seed,
-            purpose: "evaluation",
+            purpose,
             first: 0,
-            count: run.eval_episodes,
+            count: times * run.eval_episodes,
         };
         let actor = Actor::Mean(self.agent.ppo.policy.freeze());
         let trial = Trial {
@@ -292,7 +306,7 @@ impl Session {
             duties.attend(requests);
             Ok(())
         })?;
-        let score = played.map(|played| Score::of(&played, ctrl_dt));
+        let score = played.map(|played| Score::of(&played, self.task.config.ctrl_dt));
         if let Some(score) = &score {
             duties.evaluated(self.agent.env_steps, score);
         }
@@ -303,6 +317,15 @@ impl Session {
 /// Runs what may panic. A panic becomes an error.
 fn caught<T>(run: impl FnOnce() -> Result<T>) -> Result<T> {
     schedule::caught(run).unwrap_or_else(|panic| Err(anyhow!("panic: {panic}")))
+}
+
+/// The purposes of evaluation episodes, and their number in multiples of `run.eval_episodes`.
+const EVALUATION: (&str, usize) = ("evaluation", 1);
+const CONFIRMATION: (&str, usize) = ("confirmation", 4);
+
+/// The figures by which the best policy is chosen: goals per episode, and rotation error in rad.
+fn rank(score: &Score) -> [f64; 2] {
+    [score["goals"], score["rot_dist"]]
 }
 
 /// The figures by which a run that ends when evaluations no longer rise is compared with its start.
@@ -377,6 +400,35 @@ mod tests {
         assert_eq!(after(50), [50, 100, 150, 200, 250, 300]);
         assert_eq!(after(100), [50, 100, 200, 300]);
         assert_eq!(after(20)[..4], [20, 40, 60, 80]);
+    }
+
+    #[test]
+    fn a_policy_is_the_best_only_if_its_score_in_other_episodes_confirms_that() {
+        let now = Requests::none();
+        let mut seeds = (0..).map(|seed| {
+            let sets = [
+                "env.num_envs=2",
+                "ppo.hidden=[8]",
+                "run.eval_episodes=1",
+                &format!("run.seed={seed}"),
+            ];
+            let session = from_scratch(&sets.map(|set| set.parse().unwrap()));
+            let scores = [EVALUATION, CONFIRMATION]
+                .map(|episodes| session.score(episodes, &now, &mut Follower));
+            (session, scores.map(|score| rank(&score.unwrap().unwrap())))
+        });
+        let lucky = seeds.find(|(_, [score, confirmation])| beats(*score, Some(*confirmation)));
+        let (mut session, [score, confirmation]) = lucky.unwrap();
+        let between = [0.0, (score[1] + confirmation[1]) / 2.0];
+        for (before, after) in [(between, between), ([0.0, 9.0], confirmation)] {
+            session.best = Some(before);
+            let (found, improved) = session
+                .evaluate(true, &now, &mut Follower)
+                .unwrap()
+                .unwrap();
+            assert_eq!((rank(&found), improved), (score, before != after));
+            assert_eq!(session.best, Some(after));
+        }
     }
 
     #[test]
