@@ -50,7 +50,7 @@
 //!
 //! `env` and `ppo` do not depend on each other. They are combined in `agent`, `evaluate` and the modules above. `run` depends
 //! on neither. There are no import cycles between files. Each part of the outside world (MuJoCo, candle, files, the terminal)
-//! is confined to one folder, unsafe code to eight files.
+//! is confined to one folder, unsafe code to nine files.
 //!
 //! # Data path of an iteration
 //! There are N environments in blocks of n, T steps, and O and A values in an observation and an action. A block's arrays

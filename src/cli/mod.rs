@@ -238,8 +238,8 @@ pub struct PlayArgs {
     #[arg(long, help_heading = OUTPUT)]
     pub robustness: bool,
     /// Write a film (.mp4, .gif), a file for any browser (.html; at most 20 episodes), the first episodes as JSON lines (.jsonl,
-    /// .jsonl.gz; at least 2000 records), or the table of --robustness (.svg, .png); repeatable; jsonl:FILE names the kind of a FILE
-    /// without an ending
+    /// .jsonl.gz; at least 2000 records), or the table of --robustness (.svg, .png); repeatable; jsonl:FILE names the format of a
+    /// FILE without an extension
     #[arg(long, value_name = "FILE", help_heading = OUTPUT, value_parser = destination(&["mp4", "gif", "html", "jsonl", "svg", "png"]))]
     pub out: Vec<Destination>,
     /// Write the episodes of this trace as the .html of --out, without playing again
