@@ -118,7 +118,8 @@ class Policy:
             layers: weights `[outputs, inputs]` and biases `[outputs]` of each layer, from the observation to the mean actions. The last
                 layer has no activation: environments clip actions to [-1, 1].
             activation: `"elu"`, `"relu"` or `"tanh"`, after each layer but the last.
-            task: the environments in which it was learnt, a `VectorEnv` or an `Env`. Their settings, scene and steps so far go into the file.
+            task: the environments in which it was learnt, a `VectorEnv` or an `Env`. Their settings, the
+                steps so far, and a record of their hand and scene go into the file.
             normalizer: how it normalises observations. None: not at all.
             std: the standard deviation of its actions, or of each `[A]`, where actions are drawn.
 

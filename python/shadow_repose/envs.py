@@ -42,7 +42,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         num_envs: the number N of environments.
         threads: worker threads. 0 means one per core.
         seed: the seed of the episodes until `reset` names another. Environment i plays the episodes i, i + N, i + 2 N, …
-        config: a settings file of the program. Its `[ppo]` and `[run]` are not used.
+        config: a settings file of the program. Of its `[ppo]` and `[run]`, only `ppo.horizon` is used, with `training=True`.
         set: single settings, as `--set`: `{"env.friction_scale": 0.8}`.
         world: settings that change how the hand and the object move, but are unknown to the model that predicts (`env.prediction`).
         policy: a policy, or a place that `Policy.load` takes. The task is then the policy's training task.
@@ -199,8 +199,8 @@ class VectorEnv(gymnasium.vector.VectorEnv):
 
     @property
     def env_steps(self) -> int:
-        """Control steps so far, over all environments. With `training=True` they determine the lesson, which applies for 16 steps of
-        all environments, as in `train`. Set them to continue from a later point.
+        """Control steps so far, over all environments. With `training=True` they determine the lesson, which applies for `ppo.horizon`
+        steps of all environments, as in `train`. Set them to continue from a later point.
         """
         return self._open().env_steps
 

@@ -21,7 +21,7 @@ const CHECKSUM: u32 = 0x88cc_c91c;
 
 /// The contents of the mesh files, whose `names` are sorted. Fetches them first unless the cache folder has them undamaged. A
 /// command that can do without them waits ten seconds, and not again for a day if that was in vain. One who has `asked` for them waits
-/// as long as it takes, and is told where they are.
+/// up to ten minutes, and is told where they are.
 ///
 /// # Errors
 /// Fails if the files are neither cached nor available, with pip's reason.

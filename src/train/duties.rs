@@ -21,6 +21,9 @@ use crate::run::Report;
 const FAR: f64 = 10.0;
 const FAR_FOR: u32 = 20;
 
+/// How many times as many episodes confirm a new best policy as an evaluation has.
+pub const CONFIRMED_BY: usize = 4;
+
 /// What a rank does besides computing. By default that is nothing.
 pub trait Duties {
     /// Whether the user asks by a file to stop.
@@ -174,7 +177,8 @@ impl Lead {
             held.folder.place().display()
         );
         if let Some(rise) = &session.rise {
-            os::say_line(&before_and_after(rise, session.config.run.eval_episodes));
+            let episodes = CONFIRMED_BY * session.config.run.eval_episodes;
+            os::say_line(&before_and_after(rise, episodes));
         }
         if !self.quiet {
             say_what_next(&held.folder.place(), &session.config.env);

@@ -24,7 +24,7 @@ use crate::ranks::{self, Exchange};
 use crate::repose::{EpisodeStats, HEADLINE, Repose, Score, StepSums};
 use crate::run::Histogram;
 use crate::schedule;
-use duties::{Duties, Follower, Lead};
+use duties::{CONFIRMED_BY, Duties, Follower, Lead};
 use hints::hints;
 use lockstep::Stop;
 use log::histograms;
@@ -321,7 +321,7 @@ fn caught<T>(run: impl FnOnce() -> Result<T>) -> Result<T> {
 
 /// The purposes of evaluation episodes, and their number in multiples of `run.eval_episodes`.
 const EVALUATION: (&str, usize) = ("evaluation", 1);
-const CONFIRMATION: (&str, usize) = ("confirmation", 4);
+const CONFIRMATION: (&str, usize) = ("confirmation", CONFIRMED_BY);
 
 /// The figures by which the best policy is chosen: goals per episode, and rotation error in rad.
 fn rank(score: &Score) -> [f64; 2] {
