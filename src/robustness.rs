@@ -184,10 +184,6 @@ fn played(
 
 /// All rows: the task itself, the single changes, and the grid.
 fn conditions() -> Vec<Condition> {
-    let set = |key: &str, value: &str| Override {
-        key: key.into(),
-        value: value.into(),
-    };
     let mut conditions = vec![Condition {
         name: "nominal".into(),
         sets: Vec::new(),
@@ -201,7 +197,7 @@ fn conditions() -> Vec<Condition> {
             };
             conditions.push(Condition {
                 name,
-                sets: vec![set(key, value)],
+                sets: vec![Override::new(key, value)],
             });
         }
     }
@@ -209,7 +205,7 @@ fn conditions() -> Vec<Condition> {
         for mass in MASSES {
             conditions.push(Condition {
                 name: format!("friction {friction}, cube mass {mass}"),
-                sets: vec![set(FRICTION, friction), set(MASS, mass)],
+                sets: vec![Override::new(FRICTION, friction), Override::new(MASS, mass)],
             });
         }
     }

@@ -146,10 +146,7 @@ fn changed(usual: &[f64], values: &[f64]) -> Vec<Override> {
         .zip(values)
         .filter(|(_, (usual, value))| usual != value);
     changed
-        .map(|((key, ..), (_, value))| Override {
-            key: (*key).into(),
-            value: value.to_string(),
-        })
+        .map(|((key, ..), (_, value))| Override::new(*key, value))
         .collect()
 }
 

@@ -24,12 +24,12 @@ use crate::ranks::{self, Exchange};
 use crate::repose::{EpisodeStats, HEADLINE, Repose, Score, StepSums};
 use crate::run::Histogram;
 use crate::schedule;
-use duties::{Duties, Follower, Lead};
+use duties::Lead;
 use hints::hints;
-use lockstep::Stop;
+
 use log::histograms;
 use memory::need;
-use outcome::Outcome;
+use outcome::{Outcome, Stop};
 use session::Session;
 
 /// Trains until all steps are made or a stop is requested, and returns the exit code of the program. If a launcher has started
@@ -97,12 +97,14 @@ fn lead(args: &TrainArgs, requests: &Requests, exchange: &Exchange) -> Result<Ex
             say!("note: {note}");
         }
     }
-    let mut lead = Lead::new(&session, saver, args.quiet);
+    let mut lead = Lead::new(&session.config, saver, args.quiet);
     if args.resume.is_none() {
         lead.open_folder()?;
     }
-    let ended = run(&mut session, &mut lead, requests);
-    lead.end(&session, ended)
+    session.lead = Some(lead);
+    let ended = run(&mut session, requests);
+    let lead = session.lead.take().expect("the first rank leads");
+    lead.end(&session.config, session.is_flat(), ended)
 }
 
 /// Computes, and leaves reporting and saving to the first rank.
@@ -112,36 +114,30 @@ fn follow(requests: &Requests, exchange: &Exchange) -> Result<ExitCode> {
         return Ok(ExitCode::SUCCESS);
     }
     requests.wait_for_end();
-    let stop = run(&mut session, &mut Follower, requests)?;
+    let stop = run(&mut session, requests)?;
     Ok(os::exit_code(stop.map_or(0, |stop| stop.signal)))
 }
 
 /// Iterates until all steps are made, or until a stop is requested, which is returned. All ranks run it together.
-fn run(
-    session: &mut Session,
-    duties: &mut dyn Duties,
-    requests: &Requests,
-) -> Result<Option<Stop>> {
+fn run(session: &mut Session, requests: &Requests) -> Result<Option<Stop>> {
     let by_signal = || Stop {
         by_file: false,
         signal: requests.signal(),
     };
-    if !session.begin(requests, duties)? {
+    if !session.begin(requests)? {
         return Ok(Some(by_signal()));
     }
     while !session.finished() {
-        let Some(outcome) = session.iterate(requests, duties)? else {
+        let Some(outcome) = session.iterate(requests)? else {
             return Ok(Some(by_signal()));
         };
-        if outcome.decision.hand_over {
-            duties.keep(session.checkpoint());
+        // All ranks put it together.
+        let state = outcome.decision.hand_over.then(|| session.checkpoint());
+        if let Some(lead) = &mut session.lead {
+            lead.report(&session.config, &session.agent, &outcome, state)?;
         }
-        duties.report(session, &outcome)?;
         if outcome.decision.stop.is_some() {
             return Ok(outcome.decision.stop);
-        }
-        if outcome.decision.save {
-            duties.save();
         }
     }
     Ok(None)
@@ -153,7 +149,7 @@ impl Session {
     ///
     /// # Errors
     /// Fails if a loss is not finite, after a panic, or if others do not have the same weights.
-    fn iterate(&mut self, requests: &Requests, duties: &mut dyn Duties) -> Result<Option<Outcome>> {
+    fn iterate(&mut self, requests: &Requests) -> Result<Option<Outcome>> {
         let number = self.agent.iteration + 1;
         let now = self.requests_now(requests);
         let iterate = || {
@@ -164,7 +160,7 @@ impl Session {
             };
             let traffic = self.agent.exchange.take_traffic();
             let due = evaluates(self.agent.iteration, self.config.run.eval_every);
-            let Some(evaluation) = self.evaluate(due, &now, duties)? else {
+            let Some(evaluation) = self.evaluate(due, &now)? else {
                 return Ok(None);
             };
             let improved = self.take_down(&evaluation);
@@ -177,7 +173,7 @@ impl Session {
                 traffic,
                 histograms: self.histograms(),
                 dumps: self.dumps(),
-                decision: self.decide(requests, duties.is_stopped_by_file(), improved)?,
+                decision: self.decide(requests, improved)?,
             }))
         };
         caught(iterate).with_context(|| format!("iteration {number}"))
@@ -221,10 +217,10 @@ impl Session {
     ///
     /// # Errors
     /// Fails as an evaluation does.
-    fn begin(&mut self, requests: &Requests, duties: &mut dyn Duties) -> Result<bool> {
+    fn begin(&mut self, requests: &Requests) -> Result<bool> {
         if self.config.run.patience > 0 && self.rise.is_none() {
             let now = self.requests_now(requests);
-            let Some(before) = caught(|| self.evaluate(true, &now, duties))? else {
+            let Some(before) = caught(|| self.evaluate(true, &now))? else {
                 return Ok(false);
             };
             let known = figures(&before);
@@ -238,7 +234,10 @@ impl Session {
                 best: known,
                 since: 0,
             });
-            duties.keep(self.checkpoint());
+            let state = self.checkpoint();
+            if let Some(lead) = &mut self.lead {
+                lead.saver.keep(state);
+            }
         }
         Ok(true)
     }
@@ -261,12 +260,7 @@ impl Session {
     }
 
     /// Plays the evaluation episodes, if they are `due`, and shows their score. Returns `None` if a stop was requested meanwhile.
-    fn evaluate(
-        &self,
-        due: bool,
-        requests: &Requests,
-        duties: &mut dyn Duties,
-    ) -> Result<Option<Score>> {
+    fn evaluate(&mut self, due: bool, requests: &Requests) -> Result<Option<Score>> {
         let ctrl_dt = self.task.config.ctrl_dt;
         if !due {
             return Ok(Some(Score::of(&[], ctrl_dt)));
@@ -289,12 +283,14 @@ impl Session {
             stop: &requests.stop,
         };
         let played = trial.play_together(&self.agent.exchange, &mut |_| {
-            duties.attend(requests);
+            if let Some(lead) = &mut self.lead {
+                lead.attend(requests);
+            }
             Ok(())
         })?;
         let score = played.map(|played| Score::of(&played, ctrl_dt));
-        if let Some(score) = &score {
-            duties.evaluated(self.agent.env_steps, score);
+        if let (Some(lead), Some(score)) = (&self.lead, &score) {
+            lead.evaluated(self.agent.env_steps, score);
         }
         Ok(score)
     }
@@ -394,18 +390,21 @@ mod tests {
             &session,
             RunFolder::create(Some(place.path()), None).unwrap(),
         );
-        let mut lead = Lead::new(&session, saver, true);
+        let mut lead = Lead::new(&session.config, saver, true);
         lead.open_folder().unwrap();
         let never = Requests::none();
         assert!(
-            session.iterate(&never, &mut lead).unwrap().is_some(),
+            session.iterate(&never).unwrap().is_some(),
             "nothing stops it"
         );
-        lead.keep(session.checkpoint());
+        lead.saver.keep(session.checkpoint());
         // A rollout with room for fewer environments than there are.
         session.agent.rollout = session.agent.ppo.rollout(&[7, 1]);
-        let error = session.iterate(&never, &mut lead).unwrap_err();
-        let error = format!("{:#}", lead.end(&session, Err(error)).unwrap_err());
+        let error = session.iterate(&never).unwrap_err();
+        let error = format!(
+            "{:#}",
+            lead.end(&session.config, false, Err(error)).unwrap_err()
+        );
         assert!(error.contains("iteration 2: panic: "), "{error}");
         let latest = place.path().join("checkpoints/latest.safetensors");
         let saved = os::read_bytes(&latest).unwrap();
@@ -421,7 +420,7 @@ mod tests {
         let session = from_scratch(&sets);
         let begin = || {
             let saver = saver_of(&session, RunFolder::create(Some(&path), None).unwrap());
-            let mut lead = Lead::new(&session, saver, true);
+            let mut lead = Lead::new(&session.config, saver, true);
             lead.open_folder().unwrap();
             lead
         };
