@@ -3,7 +3,6 @@
 
 mod browser;
 mod figures;
-mod files;
 mod plan;
 mod score;
 mod stage;

@@ -6,15 +6,14 @@ use anyhow::{Context, Result};
 
 use super::browser::about;
 use super::figures::{json_score, table};
-use super::files::Files;
 use super::plan::Outputs;
 use super::stage::Stage;
 use crate::evaluate::{Actor, Episodes, Moment, Trial};
 use crate::goal_times::GoalTimes;
-
-use crate::os::{self, Requests, say};
+use crate::os::{self, OutputFile, Requests, say};
 use crate::repose::Score;
-use crate::see;
+use crate::see::{self, About, Replay};
+use crate::trace::Trace;
 
 /// Plays the episodes without a window, writes the outputs, and prints the score. Returns the exit code of the program.
 ///
@@ -127,4 +126,65 @@ fn film(
     }
     say!("{}: {}", to.path.display(), film.finish()?);
     Ok((played.len() == count).then(|| Score::of(&played, task.config.ctrl_dt)))
+}
+
+/// The files that the user wants. They are opened before playing, so that an unwritable path is found before the score is computed.
+pub struct Files {
+    trace: Option<(OutputFile, Trace)>,
+    page: Option<Replay>,
+}
+
+impl Files {
+    /// Begins the files of these episodes.
+    ///
+    /// # Errors
+    /// Fails if one of them cannot be written.
+    pub fn begin(stage: &Stage, episodes: Episodes, outputs: &Outputs) -> Result<Self> {
+        let task = &stage.task;
+        let trace = outputs.trace.as_ref().map(|to| {
+            let trace = Trace::new(
+                task,
+                stage.actor().name(),
+                stage.origin().as_deref(),
+                episodes.seed,
+            );
+            OutputFile::create(&to.path).map(|output| (output, trace))
+        });
+        let page = outputs
+            .page
+            .as_ref()
+            .map(|to| Replay::begin(to, task, &outputs.shot, episodes.count));
+        Ok(Self {
+            trace: trace.transpose()?,
+            page: page.transpose()?,
+        })
+    }
+
+    pub fn observe(&mut self, moment: &Moment) {
+        if let Some((_, trace)) = &mut self.trace {
+            trace.record(moment);
+        }
+        if let Some(page) = &mut self.page {
+            page.observe(moment);
+        }
+    }
+
+    /// Writes the files.
+    ///
+    /// # Errors
+    /// Fails if one of them cannot be written.
+    pub fn finish(self, about: &About) -> Result<()> {
+        if let Some((output, trace)) = self.trace {
+            output.finish(trace.finish().as_bytes())?;
+        }
+        self.page.map_or(Ok(()), |page| page.finish(about))
+    }
+
+    /// Says that the files are not written, since playing was interrupted.
+    pub fn give_up(self) {
+        let trace = self.trace.map(|(output, _)| output);
+        for output in trace.into_iter().chain(self.page.map(|page| page.output)) {
+            say!("{}: interrupted, not written", output.path.display());
+        }
+    }
 }
