@@ -10,7 +10,7 @@ use serde_json::{Map, Value, json};
 use crate::config::Override;
 use crate::draw::{self, BarChart, Picture, PictureFile};
 use crate::evaluate::{Actor, Episodes, Trial};
-use crate::os::{self, Destination, Requests, number, say};
+use crate::os::{self, Destination, Interrupted, Requests, number, say};
 use crate::repose::{Score, Task, measure};
 
 /// Single changes: the start of the name of a row, the setting, and its values.
@@ -150,16 +150,22 @@ fn played(
             .map(|row| row.score);
         bar.set_message(condition.name.clone());
         let played = match known {
-            Some(known) => Some(known),
+            Some(known) => Ok(known),
             None => Trial {
                 task: &task,
                 actor,
                 episodes,
                 stop: &requests.stop,
             }
-            .score(&bar, &mut |_| {})?,
+            .score(&bar, &mut |_| {}),
         };
-        let Some(score) = played else { break };
+        if played
+            .as_ref()
+            .is_err_and(|error| error.is::<Interrupted>())
+        {
+            break;
+        }
+        let score = played?;
         if let Some(warning) = score.divergence().filter(|_| known.is_none()) {
             say!("warning: {}: {warning}", condition.name);
         }

@@ -2,7 +2,7 @@
 
 use std::process::ExitCode;
 
-use anyhow::{Context, Result};
+use anyhow::Result;
 
 use super::browser::about;
 use super::figures::{json_score, table};
@@ -10,7 +10,7 @@ use super::plan::Outputs;
 use super::stage::Stage;
 use crate::evaluate::{Actor, Episodes, Moment, Trial};
 use crate::goal_times::GoalTimes;
-use crate::os::{self, OutputFile, Requests, say};
+use crate::os::{self, Interrupted, OutputFile, Requests, say};
 use crate::repose::Score;
 use crate::see::{self, About, Replay};
 use crate::trace::Trace;
@@ -44,13 +44,17 @@ pub fn score(
         #[cfg(not(feature = "video"))]
         Some(_) => anyhow::bail!(see::NO_FILMS),
         #[cfg(feature = "video")]
-        Some(to) => film(to, outputs, trial, requests, &mut observe)?,
-        None => scored(trial, &mut observe)?,
+        Some(to) => film(to, outputs, trial, requests, &mut observe),
+        None => scored(trial, &mut observe),
     };
-    let Some(played) = played else {
+    if played
+        .as_ref()
+        .is_err_and(|error| error.is::<Interrupted>())
+    {
         files.give_up();
         return Ok(os::exit_code(requests.signal()));
-    };
+    }
+    let played = played?;
     files.finish(&about(stage, episodes.seed))?;
     if let Some(warning) = played.divergence() {
         say!("warning: {warning}");
@@ -73,18 +77,15 @@ pub fn score(
                 },
                 &mut |_| {},
             )?;
-            columns.push((
-                Actor::Zero.name(),
-                zero.context("these episodes cannot be interrupted")?,
-            ));
+            columns.push((Actor::Zero.name(), zero));
         }
     }
     os::print(&table(&columns))?;
     Ok(ExitCode::SUCCESS)
 }
 
-/// Plays the episodes, several at a time. Without a score, they were interrupted.
-fn scored(trial: Trial, observe: &mut dyn FnMut(&Moment)) -> Result<Option<Score>> {
+/// Plays the episodes, several at a time.
+fn scored(trial: Trial, observe: &mut dyn FnMut(&Moment)) -> Result<Score> {
     let bar = os::progress_bar(trial.episodes.count as u64, "episodes", trial.actor.name());
     trial.score(&bar, observe)
 }
@@ -97,7 +98,7 @@ fn film(
     trial: Trial,
     requests: &Requests,
     observe: &mut dyn FnMut(&Moment),
-) -> Result<Option<Score>> {
+) -> Result<Score> {
     let task = &see::task_for_display(trial.task, shot)?;
     let Episodes { first, count, .. } = trial.episodes;
     let mut film = see::Film::create(to, task, *fps, count as u64)?;
@@ -119,13 +120,14 @@ fn film(
             film.observe(&moment)
         });
         match result {
-            Ok(Some(stats)) => played.extend(stats),
-            Ok(None) => break,
+            Ok(stats) => played.extend(stats),
+            Err(error) if error.is::<Interrupted>() => break,
             Err(error) => return Err(film.abandon().unwrap_or(error)),
         }
     }
     say!("{}: {}", to.path.display(), film.finish()?);
-    Ok((played.len() == count).then(|| Score::of(&played, task.config.ctrl_dt)))
+    anyhow::ensure!(played.len() == count, Interrupted);
+    Ok(Score::of(&played, task.config.ctrl_dt))
 }
 
 /// The files that the user wants. They are opened before playing, so that an unwritable path is found before the score is computed.

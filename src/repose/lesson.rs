@@ -60,6 +60,7 @@ impl Lesson {
         }
     }
 
+    /// The values that change during training, with their descriptions.
     pub fn described(&self) -> Vec<(Description, f64)> {
         let mut all = vec![
             (

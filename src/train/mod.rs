@@ -18,7 +18,7 @@ use crate::check::Check;
 use crate::cli::TrainArgs;
 use crate::config::Config;
 use crate::evaluate::{Actor, Episodes, Trial};
-use crate::os::{self, Requests, say};
+use crate::os::{self, Interrupted, Requests, say};
 use crate::ppo::{Rise, beats};
 use crate::ranks::{self, Exchange};
 use crate::repose::{EpisodeStats, HEADLINE, Repose, Score, StepSums};
@@ -102,7 +102,13 @@ fn lead(args: &TrainArgs, requests: &Requests, exchange: &Exchange) -> Result<Ex
         lead.open_folder()?;
     }
     session.lead = Some(lead);
-    let ended = run(&mut session, requests);
+    let ended = match run(&mut session, requests) {
+        Err(error) if error.is::<Interrupted>() => Ok(Some(Stop {
+            by_file: false,
+            signal: requests.signal(),
+        })),
+        ended => ended,
+    };
     let lead = session.lead.take().expect("the first rank leads");
     lead.end(&session.config, session.is_flat(), ended)
 }
@@ -118,19 +124,14 @@ fn follow(requests: &Requests, exchange: &Exchange) -> Result<ExitCode> {
     Ok(os::exit_code(stop.map_or(0, |stop| stop.signal)))
 }
 
-/// Iterates until all steps are made, or until a stop is requested, which is returned. All ranks run it together.
+/// Iterates until all steps are made, or until all ranks agree on a stop, which is returned. All ranks run it together.
+///
+/// # Errors
+/// Fails as an iteration does.
 fn run(session: &mut Session, requests: &Requests) -> Result<Option<Stop>> {
-    let by_signal = || Stop {
-        by_file: false,
-        signal: requests.signal(),
-    };
-    if !session.begin(requests)? {
-        return Ok(Some(by_signal()));
-    }
+    session.begin(requests)?;
     while !session.finished() {
-        let Some(outcome) = session.iterate(requests)? else {
-            return Ok(Some(by_signal()));
-        };
+        let outcome = session.iterate(requests)?;
         // All ranks put it together.
         let state = outcome.decision.hand_over.then(|| session.checkpoint());
         if let Some(lead) = &mut session.lead {
@@ -144,28 +145,25 @@ fn run(session: &mut Session, requests: &Requests) -> Result<Option<Stop>> {
 }
 
 impl Session {
-    /// Runs one iteration: collects, learns, evaluates when that is due, and decides what follows. Returns `None` if a stop was
-    /// requested meanwhile. If the iteration does not complete, only the state at the end of the previous one can be used.
+    /// Runs one iteration: collects, learns, evaluates when that is due, and decides what follows. If the
+    /// iteration does not complete, only the state at the end of the previous one can be used.
     ///
     /// # Errors
-    /// Fails if a loss is not finite, after a panic, or if others do not have the same weights.
-    fn iterate(&mut self, requests: &Requests) -> Result<Option<Outcome>> {
+    /// Fails if a loss is not finite, after a panic, or if others do not have the same weights. Fails as interrupted if a stop was
+    /// requested meanwhile.
+    fn iterate(&mut self, requests: &Requests) -> Result<Outcome> {
         let number = self.agent.iteration + 1;
         let now = self.requests_now(requests);
         let iterate = || {
             // What was exchanged since the last iteration is not counted.
             self.agent.exchange.take_traffic();
-            let Some(iteration) = self.agent.iterate(&now.stop)? else {
-                return Ok(None);
-            };
+            let iteration = self.agent.iterate(&now.stop)?;
             let traffic = self.agent.exchange.take_traffic();
             let due = evaluates(self.agent.iteration, self.config.run.eval_every);
-            let Some(evaluation) = self.evaluate(due, &now)? else {
-                return Ok(None);
-            };
+            let evaluation = self.evaluate(due, &now)?;
             let improved = self.take_down(&evaluation);
             let (ended, steps) = self.take_results();
-            Ok(Some(Outcome {
+            Ok(Outcome {
                 iteration,
                 ended,
                 steps,
@@ -174,7 +172,7 @@ impl Session {
                 histograms: self.histograms(),
                 dumps: self.dumps(),
                 decision: self.decide(requests, improved)?,
-            }))
+            })
         };
         caught(iterate).with_context(|| format!("iteration {number}"))
     }
@@ -212,17 +210,14 @@ impl Session {
         }
     }
 
-    /// Evaluates before the first iteration, if the run ends when evaluations no longer rise. Says whether it can go on: no stop
-    /// was requested meanwhile.
+    /// Evaluates before the first iteration, if the run ends when evaluations no longer rise.
     ///
     /// # Errors
     /// Fails as an evaluation does.
-    fn begin(&mut self, requests: &Requests) -> Result<bool> {
+    fn begin(&mut self, requests: &Requests) -> Result<()> {
         if self.config.run.patience > 0 && self.rise.is_none() {
             let now = self.requests_now(requests);
-            let Some(before) = caught(|| self.evaluate(true, &now))? else {
-                return Ok(false);
-            };
+            let before = caught(|| self.evaluate(true, &now))?;
             let known = figures(&before);
             ensure!(
                 known.iter().all(|x| x.is_finite()),
@@ -239,7 +234,7 @@ impl Session {
                 lead.saver.keep(state);
             }
         }
-        Ok(true)
+        Ok(())
     }
 
     /// Records an evaluation, if the score is one, and returns whether it is the best so far.
@@ -259,11 +254,11 @@ impl Session {
         improved
     }
 
-    /// Plays the evaluation episodes, if they are `due`, and shows their score. Returns `None` if a stop was requested meanwhile.
-    fn evaluate(&mut self, due: bool, requests: &Requests) -> Result<Option<Score>> {
+    /// Plays the evaluation episodes, if they are `due`, and shows their score.
+    fn evaluate(&mut self, due: bool, requests: &Requests) -> Result<Score> {
         let ctrl_dt = self.task.config.ctrl_dt;
         if !due {
-            return Ok(Some(Score::of(&[], ctrl_dt)));
+            return Ok(Score::of(&[], ctrl_dt));
         }
         let task = self
             .task
@@ -288,9 +283,9 @@ impl Session {
             }
             Ok(())
         })?;
-        let score = played.map(|played| Score::of(&played, ctrl_dt));
-        if let (Some(lead), Some(score)) = (&self.lead, &score) {
-            lead.evaluated(self.agent.env_steps, score);
+        let score = Score::of(&played, ctrl_dt);
+        if let Some(lead) = &self.lead {
+            lead.evaluated(self.agent.env_steps, &score);
         }
         Ok(score)
     }
@@ -393,10 +388,7 @@ mod tests {
         let mut lead = Lead::new(&session.config, saver, true);
         lead.open_folder().unwrap();
         let never = Requests::none();
-        assert!(
-            session.iterate(&never).unwrap().is_some(),
-            "nothing stops it"
-        );
+        session.iterate(&never).unwrap();
         lead.saver.keep(session.checkpoint());
         // A rollout with room for fewer environments than there are.
         session.agent.rollout = session.agent.ppo.rollout(&[7, 1]);
