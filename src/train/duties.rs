@@ -61,12 +61,7 @@ impl Lead {
     pub fn open_folder(&mut self) -> Result<()> {
         self.saver
             .open_folder(&mut self.report)
-            .inspect_err(|_| self.give_back())
-    }
-
-    /// Clears the folder of a run that could not begin.
-    pub fn give_back(&self) {
-        self.saver.give_back();
+            .inspect_err(|_| self.saver.give_back())
     }
 
     /// Warns of physics that diverge, once: the total follows at the end. Warns of updates that are too large.

@@ -416,7 +416,7 @@ mod tests {
             lead.open_folder().unwrap();
             lead
         };
-        begin().give_back();
+        begin().saver.give_back();
         assert!(!path.exists());
         let lost = begin();
         std::process::Command::new("rm")
@@ -425,7 +425,7 @@ mod tests {
             .status()
             .unwrap();
         let other = begin();
-        lost.give_back();
+        lost.saver.give_back();
         assert!(path.join("checkpoints/latest.safetensors").exists());
         drop(other);
     }
