@@ -101,20 +101,25 @@ fn metadata(loaded: &Loaded, task: &Task) -> Vec<(&'static str, String)> {
         ),
         ("vel_obs_scale", config.vel_obs_scale.to_string()),
     ];
-    // What is known of the training run that made the policy.
-    let Checkpoint {
-        progress,
-        provenance,
-        ..
-    } = &loaded.checkpoint;
+    add_training(&mut facts, &loaded.checkpoint);
+    facts
+}
+
+/// Adds what is known of the training run that made the policy.
+fn add_training(facts: &mut Vec<(&'static str, String)>, checkpoint: &Checkpoint) {
+    let progress = &checkpoint.progress;
     facts.extend((progress.env_steps > 0).then(|| ("env_steps", progress.env_steps.to_string())));
     facts.extend(
         progress
             .best
             .map(|[goals, _]| ("goals_per_episode", goals.to_string())),
     );
-    facts.extend(provenance.clone().map(|text| ("provenance", text)));
-    facts
+    facts.extend(
+        checkpoint
+            .provenance
+            .clone()
+            .map(|text| ("provenance", text)),
+    );
 }
 
 fn described(hand: &Hand) -> String {

@@ -102,6 +102,21 @@ fn lead(args: &TrainArgs, requests: &Requests, exchange: &Exchange) -> Result<Ex
         lead.open_folder()?;
     }
     session.lead = Some(lead);
+    conduct(session, requests)
+}
+
+/// Computes, and leaves reporting and saving to the first rank.
+fn follow(requests: &Requests, exchange: &Exchange) -> Result<ExitCode> {
+    let session = Session::follow(exchange)?;
+    if session.finished() {
+        return Ok(ExitCode::SUCCESS);
+    }
+    requests.wait_for_end();
+    conduct(session, requests)
+}
+
+/// Runs the training to its end. All ranks do so together.
+fn conduct(mut session: Session, requests: &Requests) -> Result<ExitCode> {
     let ended = match run(&mut session, requests) {
         Err(error) if error.is::<Interrupted>() => Ok(Some(Stop {
             by_file: false,
@@ -109,25 +124,13 @@ fn lead(args: &TrainArgs, requests: &Requests, exchange: &Exchange) -> Result<Ex
         })),
         ended => ended,
     };
-    let lead = session.lead.take().expect("the first rank leads");
-    lead.end(&session.config, session.is_flat(), ended)
-}
-
-/// Computes, and leaves reporting and saving to the first rank.
-fn follow(requests: &Requests, exchange: &Exchange) -> Result<ExitCode> {
-    let mut session = Session::follow(exchange)?;
-    if session.finished() {
-        return Ok(ExitCode::SUCCESS);
+    match session.lead.take() {
+        Some(lead) => lead.end(&session.config, session.is_flat(), ended),
+        None => Ok(os::exit_code(ended?.map_or(0, |stop| stop.signal))),
     }
-    requests.wait_for_end();
-    let stop = run(&mut session, requests)?;
-    Ok(os::exit_code(stop.map_or(0, |stop| stop.signal)))
 }
 
-/// Iterates until all steps are made, or until all ranks agree on a stop, which is returned. All ranks run it together.
-///
-/// # Errors
-/// Fails as an iteration does.
+/// Iterates until all steps are made, or until the ranks agree on a stop, which is returned.
 fn run(session: &mut Session, requests: &Requests) -> Result<Option<Stop>> {
     session.begin(requests)?;
     while !session.finished() {
