@@ -160,10 +160,8 @@ fn play(task: &Arc<Task>, episode: u64, std: f32) -> Played {
         }
         for (near, &tip) in played.near.iter_mut().zip(tips) {
             let tip = env.sim.pose(tip).position;
-            let apart: f64 = (0..3)
-                .map(|axis| (tip[axis] - object.position[axis]).powi(2))
-                .sum();
-            *near |= apart.sqrt() < reach;
+            let apart = [0, 1, 2].map(|axis| tip[axis] - object.position[axis]);
+            *near |= quat::length(&apart) < reach;
         }
         if end.is_some() {
             played.dropped = env.episode().dropped;

@@ -7,14 +7,14 @@ use std::f64::consts::TAU;
 use std::ops::Range;
 use std::path::Path;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::AtomicBool;
 
 use anyhow::{Result, anyhow, ensure};
 use rand_distr::{Distribution, StandardNormal};
 use rayon::prelude::*;
 
 use crate::env::{End, Env};
-use crate::os::Bar;
+use crate::os::{Bar, expect_no_stop};
 use crate::ppo::{FrozenPolicy, GROUP, Policy};
 use crate::ranks::Exchange;
 use crate::repose::{EpisodeStats, Repose, Score, Task};
@@ -187,30 +187,31 @@ pub fn expect_finite_values(task: &Arc<Task>, policy: &Policy) -> Result<()> {
 }
 
 impl Trial<'_> {
-    /// Plays the episodes and returns them in order, or `None` if they were interrupted. The observer sees the steps of one
+    /// Plays the episodes and returns them in order. The observer sees the steps of one
     /// episode in order, interleaved with the steps of other episodes.
     ///
     /// # Errors
-    /// Fails if the observer does, if an action is not finite, or, with the episode's number, if an episode panics.
-    pub fn play(&self, observer: &mut Observer) -> Result<Option<Vec<EpisodeStats>>> {
+    /// Fails if the observer does, if an action is not finite, or, with the episode's number, if an episode panics. Fails as
+    /// interrupted if a stop was requested.
+    pub fn play(&self, observer: &mut Observer) -> Result<Vec<EpisodeStats>> {
         self.play_together(&Exchange::alone(1), observer)
     }
 
-    /// Plays the episodes and returns their score, or `None` if they were interrupted. `bar` counts them.
+    /// Plays the episodes and returns their score. `bar` counts them.
     ///
     /// # Errors
-    /// Fails with the episode's number if an episode panics.
-    pub fn score(&self, bar: &Bar, observe: &mut dyn FnMut(&Moment)) -> Result<Option<Score>> {
+    /// Fails as [`Trial::play`] does.
+    pub fn score(&self, bar: &Bar, observe: &mut dyn FnMut(&Moment)) -> Result<Score> {
         let played = self.play(&mut |moment| {
             observe(&moment);
             bar.inc(moment.ends().into());
             Ok(())
         })?;
-        Ok(played.map(|played| Score::of(&played, self.task.config.ctrl_dt)))
+        Ok(Score::of(&played, self.task.config.ctrl_dt))
     }
 
-    /// Plays the episodes that `exchange` assigns to this rank, seen by the observer. Returns the episodes of all ranks in order,
-    /// or `None` if they were interrupted.
+    /// Plays the episodes that `exchange` assigns to this rank, seen by the observer. Returns the episodes of all ranks in
+    /// order.
     ///
     /// # Errors
     /// Fails as [`Trial::play`] does.
@@ -218,7 +219,7 @@ impl Trial<'_> {
         &self,
         exchange: &Exchange,
         observer: &mut Observer,
-    ) -> Result<Option<Vec<EpisodeStats>>> {
+    ) -> Result<Vec<EpisodeStats>> {
         let Episodes { first, count, .. } = self.episodes;
         let own = exchange.own(LANES.min(count));
         let groups = (first + own.start..first + count).step_by(LANES);
@@ -228,9 +229,7 @@ impl Trial<'_> {
         for first in groups {
             let started = group.start(first, observer)?;
             while group.lanes.iter().any(|lane| lane.running) {
-                if self.stop.load(Ordering::Relaxed) {
-                    return Ok(None);
-                }
+                expect_no_stop(self.stop)?;
                 group.step(observer)?;
             }
             let lanes = group.lanes[..started].iter_mut();
@@ -238,7 +237,7 @@ impl Trial<'_> {
         }
         let mut all = exchange.all_gather(results).concat();
         all.sort_unstable_by_key(|(number, _)| *number);
-        Ok(Some(all.into_iter().map(|(_, episode)| episode).collect()))
+        Ok(all.into_iter().map(|(_, episode)| episode).collect())
     }
 }
 

@@ -30,7 +30,7 @@
 //! | [`see`] | rendering of the task: window, film, picture, page | draw, env, evaluate, os, repose, sim |
 //! | [`trace`] | episodes as JSON lines | env, evaluate, repose |
 //! | [`goal_times`] | statistics of the time to reach a goal | config, env, evaluate |
-//! | [`agent`] | environments, learner and rollout; one iteration of training | config, env, ppo, ranks, repose, schedule, spaces |
+//! | [`agent`] | environments, learner and rollout; one iteration of training | config, env, os, ppo, ranks, repose, schedule, spaces |
 //! | [`load`] | checkpoints and policies from untrusted files | config, evaluate, os, ppo, repose, run, sim |
 //! | [`mod@evaluate`] | whole episodes under one policy, the basis of scores | env, os, ppo, ranks, repose, rng, schedule, sim, spaces |
 //! | [`repose`] | the task: hand, observation (one table), reward, changes for training | config, env, os, quat, rng, sim, spaces |

@@ -9,7 +9,7 @@ use std::sync::Arc;
 
 use anyhow::{Context, Error, Result, ensure};
 
-use crate::config::{BUILTIN_MODEL, Config, MODEL, Override, PpoConfig, Reader, Settings, Source};
+use crate::config::{Config, Override, PpoConfig, Reader, Settings, Source};
 use crate::evaluate::Actor;
 use crate::os::{self, say};
 use crate::ppo::{Checkpoint, Damaged, Policy, Progress};
@@ -94,35 +94,22 @@ impl PolicySource {
         }
     }
 
-    /// Reads the policy for use in any scene, regardless of its training scene.
+    /// Reads the checkpoint or policy.
     ///
     /// # Errors
-    /// Fails as [`PolicySource::load`] does.
-    pub fn load_for_any_scene(&self) -> Result<(Checkpoint, Config)> {
-        self.load(&[Override {
-            key: MODEL.into(),
-            value: BUILTIN_MODEL.into(),
-        }])
-    }
-
-    /// Reads the checkpoint or policy and the settings for playing it, overlaid with `overrides`.
-    ///
-    /// # Errors
-    /// Fails as [`read`] and [`settings`] do.
-    pub fn load(&self, overrides: &[Override]) -> Result<(Checkpoint, Config)> {
-        let checkpoint = match self {
-            Self::BuiltIn(policy) => Checkpoint::parse(policy.bytes)?,
-            Self::File(path) => read(path)?,
-        };
-        let config = self.settings(&checkpoint, overrides)?;
-        Ok((checkpoint, config))
+    /// Fails as [`read`] does.
+    pub fn load(&self) -> Result<Checkpoint> {
+        match self {
+            Self::BuiltIn(policy) => Checkpoint::parse(policy.bytes),
+            Self::File(path) => read(path),
+        }
     }
 
     /// The settings for playing a checkpoint from there, overlaid with `overrides`.
     ///
     /// # Errors
     /// Fails as [`settings`] does.
-    fn settings(&self, checkpoint: &Checkpoint, overrides: &[Override]) -> Result<Config> {
+    pub fn settings(&self, checkpoint: &Checkpoint, overrides: &[Override]) -> Result<Config> {
         let path = self.path();
         let player = Reader::Player {
             env_steps: checkpoint.progress.env_steps,
@@ -174,7 +161,7 @@ impl Loaded {
                 PolicySource::BuiltIn(&BUILTIN[0])
             }
         };
-        let (checkpoint, _) = origin.load(overrides)?;
+        let checkpoint = origin.load()?;
         Self::new(origin, checkpoint, overrides)
     }
 

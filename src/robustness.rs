@@ -10,7 +10,7 @@ use serde_json::{Map, Value, json};
 use crate::config::Override;
 use crate::draw::{self, BarChart, Picture, PictureFile};
 use crate::evaluate::{Actor, Episodes, Trial};
-use crate::os::{self, Destination, Requests, number, say};
+use crate::os::{self, Destination, Interrupted, Requests, number, say};
 use crate::repose::{Score, Task, measure};
 
 /// Single changes: the start of the name of a row, the setting, and its values.
@@ -150,16 +150,22 @@ fn played(
             .map(|row| row.score);
         bar.set_message(condition.name.clone());
         let played = match known {
-            Some(known) => Some(known),
+            Some(known) => Ok(known),
             None => Trial {
                 task: &task,
                 actor,
                 episodes,
                 stop: &requests.stop,
             }
-            .score(&bar, &mut |_| {})?,
+            .score(&bar, &mut |_| {}),
         };
-        let Some(score) = played else { break };
+        if played
+            .as_ref()
+            .is_err_and(|error| error.is::<Interrupted>())
+        {
+            break;
+        }
+        let score = played?;
         if let Some(warning) = score.divergence().filter(|_| known.is_none()) {
             say!("warning: {}: {warning}", condition.name);
         }
@@ -184,10 +190,6 @@ fn played(
 
 /// All rows: the task itself, the single changes, and the grid.
 fn conditions() -> Vec<Condition> {
-    let set = |key: &str, value: &str| Override {
-        key: key.into(),
-        value: value.into(),
-    };
     let mut conditions = vec![Condition {
         name: "nominal".into(),
         sets: Vec::new(),
@@ -201,7 +203,7 @@ fn conditions() -> Vec<Condition> {
             };
             conditions.push(Condition {
                 name,
-                sets: vec![set(key, value)],
+                sets: vec![Override::new(key, value)],
             });
         }
     }
@@ -209,7 +211,7 @@ fn conditions() -> Vec<Condition> {
         for mass in MASSES {
             conditions.push(Condition {
                 name: format!("friction {friction}, cube mass {mass}"),
-                sets: vec![set(FRICTION, friction), set(MASS, mass)],
+                sets: vec![Override::new(FRICTION, friction), Override::new(MASS, mass)],
             });
         }
     }

@@ -79,8 +79,11 @@ pub fn tag(name: &str) -> Option<Tag> {
     };
     let of_lesson = || {
         Some(
-            Lesson::descriptions()
-                .find(|value| value.0 == part)?
+            Lesson::default()
+                .described()
+                .into_iter()
+                .find(|(value, _)| value.0 == part)?
+                .0
                 .1
                 .to_owned(),
         )

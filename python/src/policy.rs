@@ -49,10 +49,7 @@ impl Policy {
         let of_task: Vec<Override> = overrides.iter().filter(is_of_task).cloned().collect();
         let task = self.loaded.task(&of_task)?;
         let whole = if training {
-            let learnt = Override {
-                key: "training.assist".into(),
-                value: "0".into(),
-            };
+            let learnt = Override::new("training.assist", 0);
             let overrides: Vec<Override> = [learnt].into_iter().chain(overrides).collect();
             load::settings(
                 &self.loaded.checkpoint,

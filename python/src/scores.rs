@@ -15,7 +15,7 @@ use pyo3::types::PyBytes;
 use shadow_repose::config::Symmetry;
 use shadow_repose::evaluate::{Actor, Episodes, Trial};
 use shadow_repose::goal_times::GoalTimes;
-use shadow_repose::os::OutputFile;
+use shadow_repose::os::{Interrupted, OutputFile};
 use shadow_repose::play::json_score;
 use shadow_repose::ppo::{Array, Checkpoint};
 use shadow_repose::repose::Score;
@@ -215,10 +215,14 @@ fn played(
             .iter_mut()
             .for_each(|(_, trace)| trace.record(&moment));
         Ok(())
-    })?;
-    let Some(played) = played.filter(|_| !failed()) else {
-        return Ok(Default::default());
+    });
+    let played = match played {
+        Err(error) if error.is::<Interrupted>() => return Ok(Default::default()),
+        played => played?,
     };
+    if failed() {
+        return Ok(Default::default());
+    }
     if let Some((file, trace)) = output {
         file.finish(trace.finish().as_bytes())?;
     }

@@ -11,6 +11,7 @@ use anyhow::{Context, Result, ensure};
 
 use crate::config::{Config, PpoConfig};
 use crate::env::{End, Env, EnvBlock, EnvPool, EnvState, Resumable};
+use crate::os::expect_no_stop;
 use crate::ppo::{
     Array, Checkpoint, Fork, Ppo, Progress, Rollout, RolloutBlock, UpdateStats, Workspace,
 };
@@ -131,44 +132,41 @@ impl<E: Env> Agent<E> {
         })
     }
 
-    /// Runs one iteration: collects a rollout and learns from it. Returns `None` if `stop` was set meanwhile. After that, and
-    /// after an error, the agent must be restored before it is used again.
+    /// Runs one iteration: collects a rollout and learns from it. After an error, the agent must be restored before it is used
+    /// again.
     ///
     /// # Errors
-    /// Fails if an environment panics, or if a loss, gradient or weight is not finite.
-    pub fn iterate(&mut self, stop: &AtomicBool) -> Result<Option<Iteration<E::Lesson>>> {
+    /// Fails if an environment panics, or if a loss, gradient or weight is not finite. Fails as interrupted if `stop` was set
+    /// meanwhile.
+    pub fn iterate(&mut self, stop: &AtomicBool) -> Result<Iteration<E::Lesson>> {
         let started = Instant::now();
-        let Some(lesson) = self.collect(stop)? else {
-            return Ok(None);
-        };
+        let lesson = self.collect(stop)?;
         let collected = Instant::now();
-        let Some(update) = self
+        let update = self
             .ppo
-            .update(&mut self.rollout, self.iteration + 1, stop)?
-        else {
-            return Ok(None);
-        };
+            .update(&mut self.rollout, self.iteration + 1, stop)?;
         self.rollout.carry_over();
         let steps = self.exchange.of_all(self.rollout.samples()) as u64;
         self.iteration += 1;
         self.env_steps += steps;
         let [collect_s, update_s] =
             [collected - started, collected.elapsed()].map(|time| time.as_secs_f64());
-        Ok(Some(Iteration {
+        Ok(Iteration {
             lesson,
             update,
             steps,
             collect_s,
             update_s,
-        }))
+        })
     }
 
     /// Runs the first half of [`Agent::iterate`]: steps the environments through a whole rollout with the learner's actions. Returns
-    /// the lesson, or `None` if `stop` was set meanwhile: the blocks may then be at different steps.
+    /// the lesson.
     ///
     /// # Errors
-    /// Fails with the environment's number if an environment panics.
-    pub fn collect(&mut self, stop: &AtomicBool) -> Result<Option<E::Lesson>> {
+    /// Fails with the environment's number if an environment panics. Fails as interrupted if `stop` was set meanwhile: the blocks
+    /// may then be at different steps.
+    pub fn collect(&mut self, stop: &AtomicBool) -> Result<E::Lesson> {
         let lesson = (self.lessons)(self.env_steps);
         self.pool.set_lesson(lesson);
         self.ppo.follow_ramps(self.env_steps, &mut self.rollout);
@@ -213,7 +211,8 @@ impl<E: Env> Agent<E> {
             },
         );
         collected.into_iter().try_for_each(|(.., result)| result)?;
-        Ok((!stop.load(Ordering::Relaxed)).then_some(lesson))
+        expect_no_stop(stop)?;
+        Ok(lesson)
     }
 }
 

@@ -27,88 +27,37 @@ const GO_WITH: [Row; 7] = [
     (
         Made::Window,
         "a window",
-        &[
-            "--window",
-            "--ckpt",
-            "--stochastic",
-            "--episodes",
-            "--seed",
-            "--threads",
-            "--camera",
-            "--quality",
-            "--plain",
-        ],
+        "--window, --ckpt, --stochastic, --episodes, --seed, --threads, --camera, --quality, --plain",
     ),
     (
         Made::Web,
         "a page in a browser (--web)",
-        &[
-            "--web",
-            "--web-host",
-            "--hands",
-            "--follow",
-            "--ckpt",
-            "--stochastic",
-            "--seed",
-            "--threads",
-            "--camera",
-            "--plain",
-        ],
+        "--web, --web-host, --hands, --follow, --ckpt, --stochastic, --seed, --threads, --camera, --plain",
     ),
     (
         Made::Score,
         "a score",
-        &[
-            "--headless",
-            "--json",
-            "--out FILE.jsonl",
-            "--ckpt",
-            "--stochastic",
-            "--episodes",
-            "--seed",
-            "--threads",
-        ],
+        "--headless, --json, --out FILE.jsonl, --ckpt, --stochastic, --episodes, --seed, --threads",
     ),
     (
         Made::Robustness,
         "--robustness",
-        &[
-            "--robustness",
-            "--headless",
-            "--json",
-            "--out FILE.svg",
-            "--out FILE.png",
-            "--ckpt",
-            "--stochastic",
-            "--episodes",
-            "--seed",
-            "--threads",
-        ],
+        "--robustness, --headless, --json, --out FILE.svg, --out FILE.png, --ckpt, --stochastic, --episodes, --seed, --threads",
     ),
     (
         Made::Picture,
         "a film or a picture (--out)",
-        &[
-            "--out FILE.mp4",
-            "--out FILE.gif",
-            "--fps",
-            "--at",
-            "--seed",
-            "--size",
-            "--camera",
-            "--quality",
-            "--plain",
-        ],
+        "--out FILE.mp4, --out FILE.gif, --fps, --at, --seed, --size, --camera, --quality, --plain",
     ),
     (
         Made::Page,
         "an HTML file (--out)",
-        &["--out FILE.html", "--from-trace", "--camera", "--plain"],
+        "--out FILE.html, --from-trace, --camera, --plain",
     ),
-    (Made::Check, "a check of the hand (--check)", &["--check"]),
+    (Made::Check, "a check of the hand (--check)", "--check"),
 ];
 
-type Row = (Made, &'static str, &'static [&'static str]);
+type Row = (Made, &'static str, &'static str);
 
 /// Checks that each of the options `given` goes with something that is `made`.
 ///
@@ -119,7 +68,7 @@ pub fn expect_together(made: &[Made], given: &[String]) -> Result<(), String> {
     let names = |rows: &[Row]| Vec::from_iter(rows.iter().map(|(_, name, _)| *name));
     let is_made = |(row, ..): &Row| made.contains(row);
     for option in given {
-        let takers = rows(&|(.., options)| options.contains(&&**option));
+        let takers = rows(&|(.., options)| options.split(", ").any(|known| known == option));
         if !takers.is_empty() && !takers.iter().any(is_made) {
             return Err(format!(
                 "{option} cannot be used with {}; it applies only to {}",

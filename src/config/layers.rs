@@ -24,15 +24,22 @@ pub struct Override {
     pub value: String,
 }
 
+impl Override {
+    /// A setting by its dotted key.
+    pub fn new(key: impl Into<String>, value: impl ToString) -> Self {
+        Self {
+            key: key.into(),
+            value: value.to_string(),
+        }
+    }
+}
+
 impl std::str::FromStr for Override {
     type Err = String;
 
     fn from_str(text: &str) -> Result<Self, String> {
         match text.split_once('=') {
-            Some((key, value)) if !key.trim().is_empty() => Ok(Self {
-                key: key.trim().into(),
-                value: value.trim().into(),
-            }),
+            Some((key, value)) if !key.trim().is_empty() => Ok(Self::new(key.trim(), value.trim())),
             _ => Err(format!(
                 "`{text}` is not of the form key=value, e.g. ppo.learning_rate=1e-4"
             )),

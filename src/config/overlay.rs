@@ -89,12 +89,9 @@ fn with_zeros(text: &str) -> String {
         let joined = i > 0 && bytes[i - 1].is_ascii_alphanumeric();
         bytes[i] == b'.' && !joined && bytes.get(i + 1).is_some_and(u8::is_ascii_digit)
     };
-    let mut filled = String::new();
-    for (i, c) in text.char_indices() {
-        if begins(i) {
-            filled.push('0');
-        }
-        filled.push(c);
+    let mut filled = text.to_owned();
+    for i in (0..bytes.len()).rev().filter(|&i| begins(i)) {
+        filled.insert(i, '0');
     }
     filled
 }

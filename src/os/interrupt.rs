@@ -6,6 +6,7 @@
     reason = "only the C library reports what a signal does without changing it"
 )]
 
+use std::fmt;
 use std::mem::MaybeUninit;
 use std::process::ExitCode;
 use std::ptr::null;
@@ -14,7 +15,7 @@ use std::sync::atomic::{AtomicBool, AtomicI32, Ordering};
 use std::thread;
 use std::time::{Duration, Instant};
 
-use anyhow::{Context, Result};
+use anyhow::{Context, Result, ensure};
 use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM, SIGUSR1, SIGXFSZ};
 use signal_hook::iterator::Signals;
 use signal_hook::low_level::{emulate_default_handler, exit};
@@ -174,4 +175,23 @@ pub fn exit_code(signal: i32) -> ExitCode {
     } else {
         ExitCode::from(128 + signal as u8)
     }
+}
+
+/// The error of work that a request to stop has cut short.
+#[derive(Debug)]
+pub struct Interrupted;
+
+impl fmt::Display for Interrupted {
+    fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
+        f.write_str("interrupted")
+    }
+}
+
+/// Checks that no stop is requested.
+///
+/// # Errors
+/// Fails with [`Interrupted`] if one is.
+pub fn expect_no_stop(stop: &AtomicBool) -> Result<()> {
+    ensure!(!stop.load(Ordering::Relaxed), Interrupted);
+    Ok(())
 }

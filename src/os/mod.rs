@@ -26,7 +26,7 @@ pub use file::{
     stamp,
 };
 pub use folder::Folder;
-pub use interrupt::{Requests, exit_code};
+pub use interrupt::{Interrupted, Requests, exit_code, expect_no_stop};
 pub use lock::{Hold, LOCK, Locked};
 pub use machine::{Machine, processor_seconds, program_checksum};
 pub use meshes::hand_meshes;

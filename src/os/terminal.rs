@@ -44,14 +44,8 @@ const LONGEST_QUOTE: usize = 100;
 
 /// A text from an untrusted file, short enough for a message and on one line.
 pub fn shortened(text: &str) -> String {
-    let shown = |c: char| {
-        if c.is_control() {
-            char::REPLACEMENT_CHARACTER
-        } else {
-            c
-        }
-    };
-    let start: String = text.chars().take(LONGEST_QUOTE).map(shown).collect();
+    let start: String = text.chars().take(LONGEST_QUOTE).collect();
+    let start = start.replace(char::is_control, "\u{fffd}");
     if text.chars().nth(LONGEST_QUOTE).is_some() {
         format!("{start}…")
     } else {

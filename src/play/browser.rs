@@ -9,9 +9,10 @@ use serde_json::{Value, json};
 use toml::Table;
 
 use super::stage::{Stage, with_warnings};
+use crate::cli::PlayArgs;
 use crate::config::{MODEL, Override, Reader, Settings, Source, short};
 use crate::load::PolicySource;
-use crate::os::{self, Destination, Place, Stamp, say};
+use crate::os::{self, Destination, Stamp, say};
 use crate::repose::Task;
 use crate::run::{self, RunFolder};
 use crate::see::{self, About, Live, LiveActor, Replay, Slider, Sliders};
@@ -146,20 +147,8 @@ fn changed(usual: &[f64], values: &[f64]) -> Vec<Override> {
         .zip(values)
         .filter(|(_, (usual, value))| usual != value);
     changed
-        .map(|((key, ..), (_, value))| Override {
-            key: (*key).into(),
-            value: value.to_string(),
-        })
+        .map(|((key, ..), (_, value))| Override::new(*key, value))
         .collect()
-}
-
-/// Where the policy of each further episode comes from, or the name of an actor.
-fn place_of(stage: &Stage, followed: Option<&Followed>) -> PathBuf {
-    match (followed, &stage.policy) {
-        (Some(followed), _) => followed.path.clone(),
-        (None, Some(policy)) => policy.origin.path().to_owned(),
-        (None, None) => stage.actor().name().into(),
-    }
 }
 
 /// The policy at `path` in a task with these settings, for a page that began with a stage and the task on display.
@@ -199,32 +188,39 @@ fn another(
 /// # Errors
 /// Fails if the port cannot be opened.
 pub fn live(
-    (place, hands): (Place, u64),
+    args: &PlayArgs,
+    port: u16,
     shot: &Look,
     stage: Stage,
     mut followed: Option<Followed>,
-    (seed, set): (u64, &[Override]),
 ) -> Result<ExitCode> {
     let sliders = sliders(&stage);
     let usual = sliders.values();
     let task = see::task_for_display(&stage.task, shot)?;
-    let mut about = about(&stage, seed);
+    let mut about = about(&stage, args.seed);
+    // Where the policy of each further episode comes from, or the name of an actor.
+    let mut path = match &stage.policy {
+        Some(policy) => policy.origin.path().to_owned(),
+        None => stage.actor().name().into(),
+    };
     if let Some(followed) = &followed {
         about.title = followed.run.place().display().to_string();
         about.policy = None;
+        path.clone_from(&followed.path);
     }
-    let path = place_of(&stage, followed.as_ref());
     let stage = Rc::new(stage);
     let mut acting = stage.clone().acting(task.clone(), sliders.clone());
     let look = (&about, shot.camera);
-    let live = Live::open(place, look, hands as usize, &acting, sliders.clone())?;
+    let place = (port, args.shot.web_host.as_deref());
+    let hands = args.hands as usize;
+    let live = Live::open(place, look, hands, &acting, sliders.clone())?;
     let mut known = Vec::new();
     live.show(&mut || {
         let sets = changed(&usual, &sliders.values());
         if followed.as_mut().is_some_and(Followed::has_changed) || sets != known {
             match another(
                 &path,
-                &[set, &sets].concat(),
+                &[&args.set[..], &sets].concat(),
                 (&stage, &task, shot),
                 &sliders,
             ) {

@@ -3,7 +3,6 @@
 
 mod browser;
 mod figures;
-mod files;
 mod plan;
 mod score;
 mod stage;
@@ -43,13 +42,7 @@ pub fn play(args: &PlayArgs, requests: &Requests) -> Result<ExitCode> {
             let followed = args.follow.then(|| Followed::find(place)).transpose()?;
             let newest = followed.as_ref().map(|followed| &*followed.path);
             let stage = Stage::set(newest.or(place), args)?;
-            browser::live(
-                ((port, args.shot.web_host.as_deref()), args.hands),
-                &shot,
-                stage,
-                followed,
-                (args.seed, &args.set),
-            )
+            browser::live(args, port, &shot, stage, followed)
         }
         Plan::Robustness(report) => {
             requests.wait_for_end();

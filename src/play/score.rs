@@ -2,19 +2,18 @@
 
 use std::process::ExitCode;
 
-use anyhow::{Context, Result};
+use anyhow::Result;
 
 use super::browser::about;
 use super::figures::{json_score, table};
-use super::files::Files;
 use super::plan::Outputs;
 use super::stage::Stage;
 use crate::evaluate::{Actor, Episodes, Moment, Trial};
 use crate::goal_times::GoalTimes;
-
-use crate::os::{self, Requests, say};
+use crate::os::{self, Interrupted, OutputFile, Requests, say};
 use crate::repose::Score;
-use crate::see;
+use crate::see::{self, About, Replay};
+use crate::trace::Trace;
 
 /// Plays the episodes without a window, writes the outputs, and prints the score. Returns the exit code of the program.
 ///
@@ -45,13 +44,17 @@ pub fn score(
         #[cfg(not(feature = "video"))]
         Some(_) => anyhow::bail!(see::NO_FILMS),
         #[cfg(feature = "video")]
-        Some(to) => film(to, outputs, trial, requests, &mut observe)?,
-        None => scored(trial, &mut observe)?,
+        Some(to) => film(to, outputs, trial, requests, &mut observe),
+        None => scored(trial, &mut observe),
     };
-    let Some(played) = played else {
+    if played
+        .as_ref()
+        .is_err_and(|error| error.is::<Interrupted>())
+    {
         files.give_up();
         return Ok(os::exit_code(requests.signal()));
-    };
+    }
+    let played = played?;
     files.finish(&about(stage, episodes.seed))?;
     if let Some(warning) = played.divergence() {
         say!("warning: {warning}");
@@ -74,18 +77,15 @@ pub fn score(
                 },
                 &mut |_| {},
             )?;
-            columns.push((
-                Actor::Zero.name(),
-                zero.context("these episodes cannot be interrupted")?,
-            ));
+            columns.push((Actor::Zero.name(), zero));
         }
     }
     os::print(&table(&columns))?;
     Ok(ExitCode::SUCCESS)
 }
 
-/// Plays the episodes, several at a time. Without a score, they were interrupted.
-fn scored(trial: Trial, observe: &mut dyn FnMut(&Moment)) -> Result<Option<Score>> {
+/// Plays the episodes, several at a time.
+fn scored(trial: Trial, observe: &mut dyn FnMut(&Moment)) -> Result<Score> {
     let bar = os::progress_bar(trial.episodes.count as u64, "episodes", trial.actor.name());
     trial.score(&bar, observe)
 }
@@ -98,7 +98,7 @@ fn film(
     trial: Trial,
     requests: &Requests,
     observe: &mut dyn FnMut(&Moment),
-) -> Result<Option<Score>> {
+) -> Result<Score> {
     let task = &see::task_for_display(trial.task, shot)?;
     let Episodes { first, count, .. } = trial.episodes;
     let mut film = see::Film::create(to, task, *fps, count as u64)?;
@@ -120,11 +120,73 @@ fn film(
             film.observe(&moment)
         });
         match result {
-            Ok(Some(stats)) => played.extend(stats),
-            Ok(None) => break,
+            Ok(stats) => played.extend(stats),
+            Err(error) if error.is::<Interrupted>() => break,
             Err(error) => return Err(film.abandon().unwrap_or(error)),
         }
     }
     say!("{}: {}", to.path.display(), film.finish()?);
-    Ok((played.len() == count).then(|| Score::of(&played, task.config.ctrl_dt)))
+    anyhow::ensure!(played.len() == count, Interrupted);
+    Ok(Score::of(&played, task.config.ctrl_dt))
+}
+
+/// The files that the user wants. They are opened before playing, so that an unwritable path is found before the score is computed.
+pub struct Files {
+    trace: Option<(OutputFile, Trace)>,
+    page: Option<Replay>,
+}
+
+impl Files {
+    /// Begins the files of these episodes.
+    ///
+    /// # Errors
+    /// Fails if one of them cannot be written.
+    pub fn begin(stage: &Stage, episodes: Episodes, outputs: &Outputs) -> Result<Self> {
+        let task = &stage.task;
+        let trace = outputs.trace.as_ref().map(|to| {
+            let trace = Trace::new(
+                task,
+                stage.actor().name(),
+                stage.origin().as_deref(),
+                episodes.seed,
+            );
+            OutputFile::create(&to.path).map(|output| (output, trace))
+        });
+        let page = outputs
+            .page
+            .as_ref()
+            .map(|to| Replay::begin(to, task, &outputs.shot, episodes.count));
+        Ok(Self {
+            trace: trace.transpose()?,
+            page: page.transpose()?,
+        })
+    }
+
+    pub fn observe(&mut self, moment: &Moment) {
+        if let Some((_, trace)) = &mut self.trace {
+            trace.record(moment);
+        }
+        if let Some(page) = &mut self.page {
+            page.observe(moment);
+        }
+    }
+
+    /// Writes the files.
+    ///
+    /// # Errors
+    /// Fails if one of them cannot be written.
+    pub fn finish(self, about: &About) -> Result<()> {
+        if let Some((output, trace)) = self.trace {
+            output.finish(trace.finish().as_bytes())?;
+        }
+        self.page.map_or(Ok(()), |page| page.finish(about))
+    }
+
+    /// Says that the files are not written, since playing was interrupted.
+    pub fn give_up(self) {
+        let trace = self.trace.map(|(output, _)| output);
+        for output in trace.into_iter().chain(self.page.map(|page| page.output)) {
+            say!("{}: interrupted, not written", output.path.display());
+        }
+    }
 }

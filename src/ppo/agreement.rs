@@ -244,7 +244,6 @@ mod tests {
             (ppo.learning_rate, ppo.config.max_grad_norm) = (1e-3, norm);
             let before = ppo.policy.parameters.clone();
             ppo.update(&mut rollout, 1, &AtomicBool::new(false))
-                .unwrap()
                 .unwrap();
             let moved = before
                 .iter()

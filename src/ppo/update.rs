@@ -3,7 +3,7 @@
 use std::f64::consts::{E, TAU};
 use std::iter::repeat_n;
 use std::ops::Add;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::AtomicBool;
 
 use anyhow::{Context, Result, ensure};
 use rayon::prelude::*;
@@ -15,6 +15,7 @@ use super::gae::gae;
 use super::learning_rate;
 use super::parameters::View;
 use super::rollout::{Rollout, RolloutBlock};
+use crate::os::expect_no_stop;
 use crate::ranks::tree_sum;
 use crate::rng;
 
@@ -69,16 +70,16 @@ impl UpdateStats {
 impl Ppo {
     /// Learns from a rollout that this policy collected, then adds its observations to the normaliser. The normaliser
     /// does not change during collection and learning, so the first minibatch sees exactly the policy that acted.
-    /// The result is `None` if `stop` was set in the meantime. The learner must then be restored before it is used again.
     ///
     /// # Errors
-    /// Fails if a loss, gradient or weight is not finite. The policy must then not be used or saved.
+    /// Fails if a loss, gradient or weight is not finite. The policy must then not be used or saved. Fails as interrupted if `stop`
+    /// was set in the meantime. The learner must then be restored before it is used again.
     pub fn update(
         &mut self,
         rollout: &mut Rollout,
         iteration: u64,
         stop: &AtomicBool,
-    ) -> Result<Option<UpdateStats>> {
+    ) -> Result<UpdateStats> {
         // Runs on a worker thread: each of the many short parallel sections would put an outside thread to sleep and
         // wake it.
         rayon::scope(|_| {
@@ -100,9 +101,7 @@ impl Ppo {
             let mut steps = Vec::new();
             for epoch in 0..self.config.epochs {
                 for (part, samples) in minibatches().iter().enumerate() {
-                    if stop.load(Ordering::Relaxed) {
-                        return Ok(None);
-                    }
+                    expect_no_stop(stop)?;
                     let stage = if self.is_critic_alone(iteration) {
                         Stage::CriticAlone
                     } else if steps.is_empty() {
@@ -125,7 +124,7 @@ impl Ppo {
                 let seen: Vec<_> = rollout.blocks.iter().map(RolloutBlock::acted_on).collect();
                 self.policy.see(&seen, &self.exchange);
             }
-            Ok(Some(self.stats(&steps, explained_variance)))
+            Ok(self.stats(&steps, explained_variance))
         })
     }
 

@@ -60,7 +60,8 @@ impl Lesson {
         }
     }
 
-    fn described(&self) -> Vec<(Description, f64)> {
+    /// The values that change during training, with their descriptions.
+    pub fn described(&self) -> Vec<(Description, f64)> {
         let mut all = vec![
             (
                 Description(
@@ -104,14 +105,6 @@ impl Lesson {
         self.described()
             .into_iter()
             .map(|(about, value)| (about.0, value))
-    }
-
-    /// The descriptions of these values.
-    pub fn descriptions() -> impl Iterator<Item = Description> {
-        Self::default()
-            .described()
-            .into_iter()
-            .map(|(about, _)| about)
     }
 
     /// The reward that training adds to a step.

@@ -6,7 +6,7 @@ use crate::config::{EnvConfig, TrainingConfig};
 use crate::quat::Quat;
 
 /// A control step after its physics: what its rewards may depend on, and what they are. SI units and rad, in the world frame.
-#[derive(Clone, Debug, Default)]
+#[derive(Clone, Default)]
 pub struct Step {
     /// The goal during the step.
     pub goal: Quat,

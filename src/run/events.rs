@@ -15,9 +15,8 @@ use tensorboard_rs::record_writer::RecordWriter;
 
 use super::checkpoints::numbered_files;
 use super::histogram::Histogram;
-use super::layout::layout;
 use super::records::length_up_to;
-use super::summary::{Descriptions, text, value};
+use super::summary::{Descriptions, layout, text, value};
 use crate::os::{Cannot, expect_named, make_own, sync, sync_folder};
 
 /// The prefix and the suffix of the names of event files.

@@ -7,7 +7,6 @@ mod glance;
 mod histogram;
 mod hparams;
 mod kept;
-mod layout;
 mod metrics;
 mod records;
 mod report;

@@ -6,7 +6,6 @@
 mod clock;
 mod columns;
 mod display;
-mod dress;
 #[cfg(feature = "video")]
 mod film;
 mod live;
@@ -16,8 +15,7 @@ mod sliders;
 mod window;
 
 pub use columns::About;
-pub use display::task_for_display;
-pub use dress::{dress, mesh_files};
+pub use display::{dress, mesh_files, task_for_display};
 #[cfg(feature = "video")]
 pub use film::{Film, screenshot};
 pub use live::{Live, LiveActor};

@@ -1,20 +1,18 @@
-//! What a rank does besides computing: the first one reports and saves, the others nothing.
+//! What the first rank does besides computing: it reports and saves.
 
 use std::path::Path;
 use std::process::ExitCode;
 
 use anyhow::Result;
 
-use super::lockstep::Stop;
 use super::log::{Ended, described, row, tags};
-use super::outcome::Outcome;
+use super::outcome::{Outcome, Stop};
 use super::saver::Saver;
-use super::session::Session;
-use crate::config::{EnvConfig, scene_option};
-
+use crate::agent::Agent;
+use crate::config::{Config, EnvConfig, scene_option};
 use crate::os::{self, Requests, Status, StatusLine, say};
 use crate::ppo::{Checkpoint, Rise};
-use crate::repose::{HEADLINE, Score, divergence, measure, unpredicted};
+use crate::repose::{HEADLINE, Repose, Score, divergence, measure, unpredicted};
 use crate::run::Report;
 
 /// The factor by which, and the iterations for which, the KL divergence must lie beyond its target for a warning.
@@ -24,43 +22,11 @@ const FAR_FOR: u32 = 20;
 /// How many times as many episodes confirm a new best policy as an evaluation has.
 pub const CONFIRMED_BY: usize = 4;
 
-/// What a rank does besides computing. By default that is nothing.
-pub trait Duties {
-    /// Whether the user asks by a file to stop.
-    fn is_stopped_by_file(&self) -> bool {
-        false
-    }
-
-    /// Answers requests. Work that takes long calls this meanwhile.
-    fn attend(&mut self, _requests: &Requests) {}
-
-    /// Shows the score of an evaluation.
-    fn evaluated(&mut self, _env_steps: u64, _score: &Score) {}
-
-    /// Takes over the state at the end of an iteration, to save it.
-    fn keep(&mut self, _state: Checkpoint) {}
-
-    /// Reports an iteration.
-    ///
-    /// # Errors
-    /// Fails if the run folder cannot be written to for the first time, or if another training run has taken it.
-    fn report(&mut self, _session: &Session, _outcome: &Outcome) -> Result<()> {
-        Ok(())
-    }
-
-    /// Saves the state that was kept.
-    fn save(&mut self) {}
-}
-
-/// A rank that only computes.
-pub struct Follower;
-
-impl Duties for Follower {}
-
-/// The first rank.
+/// What the first rank does.
 pub struct Lead {
     report: Report,
-    saver: Saver,
+    /// What saves its state.
+    pub saver: Saver,
     quiet: bool,
     /// The number of steps of this session in which the physics diverged.
     diverged: u64,
@@ -72,15 +38,15 @@ pub struct Lead {
 
 impl Lead {
     /// Prepares the report of a run. A quiet one shows no progress.
-    pub fn new(session: &Session, saver: Saver, quiet: bool) -> Self {
-        let config = &session.config;
+    pub fn new(config: &Config, saver: Saver, quiet: bool) -> Self {
+        let progress = &saver.held.last.progress;
         let tags = tags(config.randomization.happens());
-        let progress = StatusLine::new(session.agent.env_steps, config.run.total_steps, quiet);
-        let mut report = Report::new(saver.held.folder.path(), &tags, progress);
+        let line = StatusLine::new(progress.env_steps, config.run.total_steps, quiet);
+        let mut report = Report::new(saver.held.folder.path(), &tags, line);
         report.descriptions = described(&tags);
         report.settings = config.to_text();
         report.hparams = config.dotted();
-        report.best = session.best.map_or(f64::NAN, |[goals, _]| goals);
+        report.best = progress.best.map_or(f64::NAN, |[goals, _]| goals);
         Self {
             report,
             saver,
@@ -98,16 +64,11 @@ impl Lead {
     pub fn open_folder(&mut self) -> Result<()> {
         self.saver
             .open_folder(&mut self.report)
-            .inspect_err(|_| self.give_back())
-    }
-
-    /// Clears the folder of a run that could not begin.
-    pub fn give_back(&self) {
-        self.saver.give_back();
+            .inspect_err(|_| self.saver.give_back())
     }
 
     /// Warns of physics that diverge, once: the total follows at the end. Warns of updates that are too large.
-    fn warn(&mut self, session: &Session, outcome: &Outcome) {
+    fn warn(&mut self, desired_kl: f64, outcome: &Outcome) {
         let Outcome {
             iteration,
             steps,
@@ -122,7 +83,6 @@ impl Lead {
             self.warned = true;
             self.report.progress.warn(&warning);
         }
-        let desired_kl = session.config.ppo.desired_kl.at(session.agent.env_steps);
         let is_far = desired_kl > 0.0 && iteration.update.losses.kl > FAR * desired_kl;
         self.far = if is_far {
             self.far.saturating_add(1)
@@ -137,11 +97,17 @@ impl Lead {
         }
     }
 
-    /// Ends the run: saves for the last time, and says how it ended. The exit code is the program's.
+    /// Ends the run: saves for the last time, and says how it ended. `is_flat`: evaluations no longer rise. The exit code is the
+    /// program's.
     ///
     /// # Errors
     /// Fails as the run has, or if the run folder cannot be written to.
-    pub fn end(mut self, session: &Session, ended: Result<Option<Stop>>) -> Result<ExitCode> {
+    pub fn end(
+        mut self,
+        config: &Config,
+        is_flat: bool,
+        ended: Result<Option<Stop>>,
+    ) -> Result<ExitCode> {
         if !matches!(ended, Ok(Some(_))) {
             self.report.end(ended.is_ok());
         }
@@ -157,16 +123,16 @@ impl Lead {
         })?;
         saved?;
         match stop {
-            None => self.finish(session),
+            None => self.finish(config, is_flat),
             Some(stop) => self.stop(stop),
         }
         Ok(os::exit_code(stop.map_or(0, |stop| stop.signal)))
     }
 
-    fn finish(&mut self, session: &Session) {
+    fn finish(&mut self, config: &Config, is_flat: bool) {
         let held = &self.saver.held;
         held.folder.mark_finished(true);
-        let why = if session.is_flat() {
+        let why = if is_flat {
             "evaluations no longer rise"
         } else {
             "finished"
@@ -176,12 +142,12 @@ impl Lead {
             held.steps_made(),
             held.folder.place().display()
         );
-        if let Some(rise) = &session.rise {
-            let episodes = CONFIRMED_BY * session.config.run.eval_episodes;
+        if let Some(rise) = &held.last.progress.rise {
+            let episodes = CONFIRMED_BY * config.run.eval_episodes;
             os::say_line(&before_and_after(rise, episodes));
         }
         if !self.quiet {
-            say_what_next(&held.folder.place(), &session.config.env);
+            say_what_next(&held.folder.place(), &config.env);
         }
         self.saver.release();
     }
@@ -203,20 +169,21 @@ impl Lead {
         say!("  {}", held.how_to_resume(&held.folder));
         self.saver.release();
     }
-}
 
-impl Duties for Lead {
-    fn is_stopped_by_file(&self) -> bool {
+    /// Whether the user asks by a file to stop.
+    pub fn is_stopped_by_file(&self) -> bool {
         self.saver.held.folder.take_stop()
     }
 
-    fn attend(&mut self, requests: &Requests) {
+    /// Answers requests. Work that takes long calls this meanwhile.
+    pub fn attend(&mut self, requests: &Requests) {
         if self.saver.held.wrote && requests.take_save() {
             self.save();
         }
     }
 
-    fn evaluated(&mut self, env_steps: u64, score: &Score) {
+    /// Shows the score of an evaluation.
+    pub fn evaluated(&self, env_steps: u64, score: &Score) {
         let found = HEADLINE.map(|column| {
             format!(
                 "{} {}",
@@ -231,26 +198,33 @@ impl Duties for Lead {
         ));
     }
 
-    fn keep(&mut self, state: Checkpoint) {
-        self.saver.keep(state);
-    }
-
-    fn report(&mut self, session: &Session, outcome: &Outcome) -> Result<()> {
+    /// Keeps the `state` after an iteration, reports the iteration, and saves if that is due.
+    ///
+    /// # Errors
+    /// Fails if the run folder cannot be written to for the first time, or if another training run has taken it.
+    pub fn report(
+        &mut self,
+        config: &Config,
+        agent: &Agent<Repose>,
+        outcome: &Outcome,
+        state: Option<Checkpoint>,
+    ) -> Result<()> {
+        state.into_iter().for_each(|state| self.saver.keep(state));
         self.saver.expect_own()?;
         self.saver.open_folder(&mut self.report)?;
         for (name, text) in &outcome.dumps {
             let dumped = self.saver.held.folder.dump(name, text);
             dumped.unwrap_or_else(|error| self.report.progress.warn(&format!("{error:#}")));
         }
-        self.warn(session, outcome);
+        self.warn(config.ppo.desired_kl.at(agent.env_steps), outcome);
         let ended = Ended::new(
             &outcome.ended,
-            session.config.env.ctrl_dt,
-            session.config.randomization.happens(),
+            config.env.ctrl_dt,
+            config.randomization.happens(),
         );
         let shown = ended.shown();
         let status = Status {
-            env_steps: session.agent.env_steps,
+            env_steps: agent.env_steps,
             steps_per_s: outcome.iteration.steps_per_s(),
             goals: shown["goals"],
             drop_rate: shown["drop_rate"],
@@ -259,11 +233,14 @@ impl Duties for Lead {
             shared: false,
         };
         self.report.iteration(
-            session.agent.iteration,
+            agent.iteration,
             &row(outcome, &ended),
             &outcome.histograms,
             &status,
         );
+        if outcome.decision.save {
+            self.save();
+        }
         Ok(())
     }
 

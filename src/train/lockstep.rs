@@ -5,28 +5,10 @@ use std::sync::atomic::Ordering;
 use anyhow::{Result, bail};
 use serde::{Deserialize, Serialize};
 
+use super::duties::Lead;
+use super::outcome::{Decision, Stop};
 use super::session::Session;
 use crate::os::Requests;
-
-/// Why a run ends before all its steps are made.
-#[derive(Clone, Copy, Debug)]
-pub struct Stop {
-    /// Whether the user has asked for it by a file.
-    pub by_file: bool,
-    /// The signal that has asked for it, or 0.
-    pub signal: i32,
-}
-
-/// What follows an iteration.
-#[derive(Debug, Default)]
-pub struct Decision {
-    /// Whether to save, although the run goes on.
-    pub save: bool,
-    /// Whether the state is handed to the saver. If nobody else waits, it always is: the next iteration may be cut short.
-    pub hand_over: bool,
-    /// Whether the run stops here, before its end.
-    pub stop: Option<Stop>,
-}
 
 /// What all ranks must know to decide.
 #[derive(Serialize, Deserialize)]
@@ -39,13 +21,14 @@ struct Vote {
 }
 
 impl Session {
-    /// Agrees with the other ranks on what follows this iteration, and checks that all have the same weights. `by_file`: the
-    /// user has asked for a stop by a file. `improved`: this iteration had the best evaluation so far.
+    /// Agrees with the other ranks on what follows this iteration, and checks that all have the same weights. `improved`:
+    /// this iteration had the best evaluation so far.
     ///
     /// # Errors
     /// Fails if the weights differ.
-    pub fn decide(&self, requests: &Requests, by_file: bool, improved: bool) -> Result<Decision> {
+    pub fn decide(&self, requests: &Requests, improved: bool) -> Result<Decision> {
         let exchange = &self.agent.exchange;
+        let by_file = self.lead.as_ref().is_some_and(Lead::is_stopped_by_file);
         // With a single rank, the next iteration stops at once.
         let asked = !exchange.is_alone() && requests.stop.load(Ordering::Relaxed);
         let votes = exchange.all_gather(Vote {

@@ -148,7 +148,7 @@ mod tests {
             .unwrap();
         let mut agent =
             Agent::for_task(&Task::new(&config).unwrap(), &config, Exchange::alone(1)).unwrap();
-        agent.iterate(&AtomicBool::new(false)).unwrap().unwrap();
+        agent.iterate(&AtomicBool::new(false)).unwrap();
         let found = histograms(&agent.rollout);
         let [(ACTIONS, actions), (ADVANTAGES, advantages)] = &found[..] else {
             panic!("{found:?}")

@@ -18,18 +18,18 @@ use crate::check::Check;
 use crate::cli::TrainArgs;
 use crate::config::Config;
 use crate::evaluate::{Actor, Episodes, Trial};
-use crate::os::{self, Requests, say};
+use crate::os::{self, Interrupted, Requests, say};
 use crate::ppo::{Rise, beats};
 use crate::ranks::{self, Exchange};
 use crate::repose::{EpisodeStats, HEADLINE, Repose, Score, StepSums};
 use crate::run::Histogram;
 use crate::schedule;
-use duties::{CONFIRMED_BY, Duties, Follower, Lead};
+use duties::{CONFIRMED_BY, Lead};
 use hints::hints;
-use lockstep::Stop;
+
 use log::histograms;
 use memory::need;
-use outcome::Outcome;
+use outcome::{Outcome, Stop};
 use session::Session;
 
 /// Trains until all steps are made or a stop is requested, and returns the exit code of the program. If a launcher has started
@@ -97,78 +97,75 @@ fn lead(args: &TrainArgs, requests: &Requests, exchange: &Exchange) -> Result<Ex
             say!("note: {note}");
         }
     }
-    let mut lead = Lead::new(&session, saver, args.quiet);
+    let mut lead = Lead::new(&session.config, saver, args.quiet);
     if args.resume.is_none() {
         lead.open_folder()?;
     }
-    let ended = run(&mut session, &mut lead, requests);
-    lead.end(&session, ended)
+    session.lead = Some(lead);
+    conduct(session, requests)
 }
 
 /// Computes, and leaves reporting and saving to the first rank.
 fn follow(requests: &Requests, exchange: &Exchange) -> Result<ExitCode> {
-    let mut session = Session::follow(exchange)?;
+    let session = Session::follow(exchange)?;
     if session.finished() {
         return Ok(ExitCode::SUCCESS);
     }
     requests.wait_for_end();
-    let stop = run(&mut session, &mut Follower, requests)?;
-    Ok(os::exit_code(stop.map_or(0, |stop| stop.signal)))
+    conduct(session, requests)
 }
 
-/// Iterates until all steps are made, or until a stop is requested, which is returned. All ranks run it together.
-fn run(
-    session: &mut Session,
-    duties: &mut dyn Duties,
-    requests: &Requests,
-) -> Result<Option<Stop>> {
-    let by_signal = || Stop {
-        by_file: false,
-        signal: requests.signal(),
+/// Runs the training to its end. All ranks do so together.
+fn conduct(mut session: Session, requests: &Requests) -> Result<ExitCode> {
+    let ended = match run(&mut session, requests) {
+        Err(error) if error.is::<Interrupted>() => Ok(Some(Stop {
+            by_file: false,
+            signal: requests.signal(),
+        })),
+        ended => ended,
     };
-    if !session.begin(requests, duties)? {
-        return Ok(Some(by_signal()));
+    match session.lead.take() {
+        Some(lead) => lead.end(&session.config, session.is_flat(), ended),
+        None => Ok(os::exit_code(ended?.map_or(0, |stop| stop.signal))),
     }
+}
+
+/// Iterates until all steps are made, or until the ranks agree on a stop, which is returned.
+fn run(session: &mut Session, requests: &Requests) -> Result<Option<Stop>> {
+    session.begin(requests)?;
     while !session.finished() {
-        let Some(outcome) = session.iterate(requests, duties)? else {
-            return Ok(Some(by_signal()));
-        };
-        if outcome.decision.hand_over {
-            duties.keep(session.checkpoint());
+        let outcome = session.iterate(requests)?;
+        // All ranks put it together.
+        let state = outcome.decision.hand_over.then(|| session.checkpoint());
+        if let Some(lead) = &mut session.lead {
+            lead.report(&session.config, &session.agent, &outcome, state)?;
         }
-        duties.report(session, &outcome)?;
         if outcome.decision.stop.is_some() {
             return Ok(outcome.decision.stop);
-        }
-        if outcome.decision.save {
-            duties.save();
         }
     }
     Ok(None)
 }
 
 impl Session {
-    /// Runs one iteration: collects, learns, evaluates when that is due, and decides what follows. Returns `None` if a stop was
-    /// requested meanwhile. If the iteration does not complete, only the state at the end of the previous one can be used.
+    /// Runs one iteration: collects, learns, evaluates when that is due, and decides what follows. If the
+    /// iteration does not complete, only the state at the end of the previous one can be used.
     ///
     /// # Errors
-    /// Fails if a loss is not finite, after a panic, or if others do not have the same weights.
-    fn iterate(&mut self, requests: &Requests, duties: &mut dyn Duties) -> Result<Option<Outcome>> {
+    /// Fails if a loss is not finite, after a panic, or if others do not have the same weights. Fails as interrupted if a stop was
+    /// requested meanwhile.
+    fn iterate(&mut self, requests: &Requests) -> Result<Outcome> {
         let number = self.agent.iteration + 1;
         let now = self.requests_now(requests);
         let iterate = || {
             // What was exchanged since the last iteration is not counted.
             self.agent.exchange.take_traffic();
-            let Some(iteration) = self.agent.iterate(&now.stop)? else {
-                return Ok(None);
-            };
+            let iteration = self.agent.iterate(&now.stop)?;
             let traffic = self.agent.exchange.take_traffic();
             let due = evaluates(self.agent.iteration, self.config.run.eval_every);
-            let Some((evaluation, improved)) = self.evaluate(due, &now, duties)? else {
-                return Ok(None);
-            };
+            let (evaluation, improved) = self.evaluate(due, &now)?;
             let (ended, steps) = self.take_results();
-            Ok(Some(Outcome {
+            Ok(Outcome {
                 iteration,
                 ended,
                 steps,
@@ -176,8 +173,8 @@ impl Session {
                 traffic,
                 histograms: self.histograms(),
                 dumps: self.dumps(),
-                decision: self.decide(requests, duties.is_stopped_by_file(), improved)?,
-            }))
+                decision: self.decide(requests, improved)?,
+            })
         };
         caught(iterate).with_context(|| format!("iteration {number}"))
     }
@@ -215,17 +212,14 @@ impl Session {
         }
     }
 
-    /// Evaluates before the first iteration, if the run ends when evaluations no longer rise. Says whether it can go on: no stop
-    /// was requested meanwhile.
+    /// Evaluates before the first iteration, if the run ends when evaluations no longer rise.
     ///
     /// # Errors
     /// Fails as an evaluation does.
-    fn begin(&mut self, requests: &Requests, duties: &mut dyn Duties) -> Result<bool> {
+    fn begin(&mut self, requests: &Requests) -> Result<()> {
         if self.config.run.patience > 0 && self.rise.is_none() {
             let now = self.requests_now(requests);
-            let Some(before) = caught(|| self.score(CONFIRMATION, &now, duties))? else {
-                return Ok(false);
-            };
+            let before = caught(|| self.score(CONFIRMATION, &now))?;
             let known = figures(&before);
             ensure!(
                 known.iter().all(|x| x.is_finite()),
@@ -237,35 +231,29 @@ impl Session {
                 best: known,
                 since: 0,
             });
-            duties.keep(self.checkpoint());
+            let state = self.checkpoint();
+            if let Some(lead) = &mut self.lead {
+                lead.saver.keep(state);
+            }
         }
-        Ok(true)
+        Ok(())
     }
 
     /// Evaluates, if that is `due`. Returns the score, which has no episodes if it is not, and whether this is the best policy so far.
-    /// Returns `None` if a stop was requested meanwhile.
     ///
     /// A policy whose score is the best so far was perhaps lucky. It is the best only if its score in other episodes confirms that.
-    fn evaluate(
-        &mut self,
-        due: bool,
-        requests: &Requests,
-        duties: &mut dyn Duties,
-    ) -> Result<Option<(Score, bool)>> {
+    fn evaluate(&mut self, due: bool, requests: &Requests) -> Result<(Score, bool)> {
         if !due {
-            return Ok(Some((Score::of(&[], self.task.config.ctrl_dt), false)));
+            return Ok((Score::of(&[], self.task.config.ctrl_dt), false));
         }
-        let Some(score) = self.score(EVALUATION, requests, duties)? else {
-            return Ok(None);
+        let score = self.score(EVALUATION, requests)?;
+        let hopeful = beats(rank(&score), self.best);
+        let judged = if hopeful {
+            self.score(CONFIRMATION, requests)?
+        } else {
+            score
         };
-        let mut judged = score;
-        if beats(rank(&score), self.best) {
-            let Some(confirmation) = self.score(CONFIRMATION, requests, duties)? else {
-                return Ok(None);
-            };
-            judged = confirmation;
-        }
-        let improved = judged.episodes > score.episodes && beats(rank(&judged), self.best);
+        let improved = hopeful && beats(rank(&judged), self.best);
         if improved {
             self.best = Some(rank(&judged));
         }
@@ -275,16 +263,15 @@ impl Session {
         {
             rise.add(figures(&judged));
         }
-        Ok(Some((score, improved)))
+        Ok((score, improved))
     }
 
-    /// Plays these of the evaluation episodes, and shows their score. Returns `None` if a stop was requested meanwhile.
+    /// Plays so many evaluation episodes for this purpose, and shows their score.
     fn score(
-        &self,
+        &mut self,
         (purpose, times): (&'static str, usize),
         requests: &Requests,
-        duties: &mut dyn Duties,
-    ) -> Result<Option<Score>> {
+    ) -> Result<Score> {
         let task = self
             .task
             .at_the_stage_of(&self.config.env.at(self.agent.env_steps));
@@ -303,12 +290,14 @@ impl Session {
             stop: &requests.stop,
         };
         let played = trial.play_together(&self.agent.exchange, &mut |_| {
-            duties.attend(requests);
+            if let Some(lead) = &mut self.lead {
+                lead.attend(requests);
+            }
             Ok(())
         })?;
-        let score = played.map(|played| Score::of(&played, self.task.config.ctrl_dt));
-        if let Some(score) = &score {
-            duties.evaluated(self.agent.env_steps, score);
+        let score = Score::of(&played, self.task.config.ctrl_dt);
+        if let Some(lead) = &self.lead {
+            lead.evaluated(self.agent.env_steps, &score);
         }
         Ok(score)
     }
@@ -412,20 +401,17 @@ mod tests {
                 "run.eval_episodes=1",
                 &format!("run.seed={seed}"),
             ];
-            let session = from_scratch(&sets.map(|set| set.parse().unwrap()));
+            let mut session = from_scratch(&sets.map(|set| set.parse().unwrap()));
             let scores = [EVALUATION, CONFIRMATION]
-                .map(|episodes| session.score(episodes, &now, &mut Follower));
-            (session, scores.map(|score| rank(&score.unwrap().unwrap())))
+                .map(|episodes| rank(&session.score(episodes, &now).unwrap()));
+            (session, scores)
         });
         let lucky = seeds.find(|(_, [score, confirmation])| beats(*score, Some(*confirmation)));
         let (mut session, [score, confirmation]) = lucky.unwrap();
         let between = [0.0, (score[1] + confirmation[1]) / 2.0];
         for (before, after) in [(between, between), ([0.0, 9.0], confirmation)] {
             session.best = Some(before);
-            let (found, improved) = session
-                .evaluate(true, &now, &mut Follower)
-                .unwrap()
-                .unwrap();
+            let (found, improved) = session.evaluate(true, &now).unwrap();
             assert_eq!((rank(&found), improved), (score, before != after));
             assert_eq!(session.best, Some(after));
         }
@@ -446,18 +432,18 @@ mod tests {
             &session,
             RunFolder::create(Some(place.path()), None).unwrap(),
         );
-        let mut lead = Lead::new(&session, saver, true);
+        let mut lead = Lead::new(&session.config, saver, true);
         lead.open_folder().unwrap();
         let never = Requests::none();
-        assert!(
-            session.iterate(&never, &mut lead).unwrap().is_some(),
-            "nothing stops it"
-        );
-        lead.keep(session.checkpoint());
+        session.iterate(&never).unwrap();
+        lead.saver.keep(session.checkpoint());
         // A rollout with room for fewer environments than there are.
         session.agent.rollout = session.agent.ppo.rollout(&[7, 1]);
-        let error = session.iterate(&never, &mut lead).unwrap_err();
-        let error = format!("{:#}", lead.end(&session, Err(error)).unwrap_err());
+        let error = session.iterate(&never).unwrap_err();
+        let error = format!(
+            "{:#}",
+            lead.end(&session.config, false, Err(error)).unwrap_err()
+        );
         assert!(error.contains("iteration 2: panic: "), "{error}");
         let latest = place.path().join("checkpoints/latest.safetensors");
         let saved = os::read_bytes(&latest).unwrap();
@@ -473,11 +459,11 @@ mod tests {
         let session = from_scratch(&sets);
         let begin = || {
             let saver = saver_of(&session, RunFolder::create(Some(&path), None).unwrap());
-            let mut lead = Lead::new(&session, saver, true);
+            let mut lead = Lead::new(&session.config, saver, true);
             lead.open_folder().unwrap();
             lead
         };
-        begin().give_back();
+        begin().saver.give_back();
         assert!(!path.exists());
         let lost = begin();
         std::process::Command::new("rm")
@@ -486,7 +472,7 @@ mod tests {
             .status()
             .unwrap();
         let other = begin();
-        lost.give_back();
+        lost.saver.give_back();
         assert!(path.join("checkpoints/latest.safetensors").exists());
         drop(other);
     }

@@ -39,7 +39,8 @@ pub struct Held {
     /// The options with which this training run is resumed.
     options: String,
     /// The state at the end of the last complete iteration.
-    last: Arc<Checkpoint>,
+    /// The state that is saved.
+    pub last: Arc<Checkpoint>,
     /// Whether this session has written into the folder.
     pub wrote: bool,
     /// The checkpoint of the best evaluation, if this session has found it.

@@ -4,6 +4,7 @@ use std::sync::Arc;
 
 use anyhow::{Context, Result};
 
+use super::duties::Lead;
 use super::saver::Saver;
 use super::start::{Plan, Takes};
 use crate::agent::Agent;
@@ -35,6 +36,8 @@ pub struct Session {
     pub scene: String,
     /// The hand and the object of the policy.
     pub hand: Record,
+    /// What the first rank does besides computing.
+    pub lead: Option<Lead>,
 }
 
 impl Session {
@@ -121,6 +124,7 @@ impl Session {
             best,
             rise: None,
             dumps,
+            lead: None,
         };
         if let Some((takes, checkpoint)) = from {
             session.start(takes, checkpoint)?;

@@ -10,7 +10,9 @@ use serde::{Deserialize, Serialize};
 use super::saver::best_so_far;
 use crate::agent::expect_states;
 use crate::cli::TrainArgs;
-use crate::config::{Config, MODEL, Override, PpoConfig, Reader, Settings, Source, short};
+use crate::config::{
+    BUILTIN_MODEL, Config, MODEL, Override, PpoConfig, Reader, Settings, Source, short,
+};
 use crate::load::{self, PolicySource};
 use crate::os::Locked;
 use crate::ppo::{Checkpoint, Fork};
@@ -107,7 +109,10 @@ impl Plan {
             return Self::new(settings.resolve()?, args);
         };
         let origin = PolicySource::find(place)?;
-        let (checkpoint, played) = origin.load_for_any_scene()?;
+        let checkpoint = origin.load()?;
+        // Regardless of its training scene.
+        let any_scene = Override::new(MODEL, BUILTIN_MODEL);
+        let played = origin.settings(&checkpoint, &[any_scene])?;
         let settings = settings.stored(load::source(&checkpoint, place), Reader::NewRun);
         let mut plan = Self::new(settings.resolve()?, args)?;
         expect_net(&checkpoint, &played.ppo, &plan.config.ppo)
@@ -292,12 +297,9 @@ fn overrides(args: &TrainArgs) -> Vec<Override> {
         ("run.threads", args.threads.map(|n| n as u64)),
         ("run.total_steps", args.total_steps),
     ];
-    let given = options.into_iter().filter_map(|(key, value)| {
-        Some(Override {
-            key: key.into(),
-            value: value?.to_string(),
-        })
-    });
+    let given = options
+        .into_iter()
+        .filter_map(|(key, value)| Some(Override::new(key, value?)));
     args.settings.set.iter().cloned().chain(given).collect()
 }
 

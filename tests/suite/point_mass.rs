@@ -5,6 +5,7 @@ use std::sync::atomic::AtomicBool;
 use shadow_repose::agent::Agent;
 use shadow_repose::config::{Backend, Geometric, PpoConfig, Precision, Ramp};
 use shadow_repose::env::{End, Env, Transition};
+use shadow_repose::os::Interrupted;
 use shadow_repose::ppo::Ppo;
 use shadow_repose::ranks::Exchange;
 use shadow_repose::rng::{self, Rng};
@@ -136,7 +137,7 @@ fn distances(settings: &PpoConfig, seed: u64) -> [f64; 2] {
     let mut agent = agent(settings, seed);
     let mut distances = Vec::new();
     for _ in 1..=60 {
-        agent.iterate(&NEVER).unwrap().expect("nothing stops it");
+        agent.iterate(&NEVER).unwrap();
         let finished = agent.pool.take_finished();
         if !finished.is_empty() {
             distances.push(finished.iter().sum::<f64>() / finished.len() as f64);
@@ -244,11 +245,7 @@ fn while_the_critic_learns_alone_the_policy_stands_still() {
         };
         let [actor, mut critic] = nets(&agent);
         for iteration in 1..=3 {
-            let stats = agent
-                .iterate(&NEVER)
-                .unwrap()
-                .expect("nothing stops it")
-                .update;
+            let stats = agent.iterate(&NEVER).unwrap().update;
             let [acts, values] = nets(&agent);
             let alone = iteration <= 2;
             assert_eq!(acts == actor, alone, "iteration {iteration}");
@@ -272,7 +269,7 @@ fn the_first_steps_of_an_actor_are_no_larger_after_the_critic_has_learnt_alone()
             ..settings()
         };
         let mut agent = agent(&settings, 3);
-        (0..critic_first).for_each(|_| assert!(agent.iterate(&NEVER).unwrap().is_some()));
+        (0..critic_first).for_each(|_| assert!(agent.iterate(&NEVER).is_ok()));
         let actor = |agent: &Agent<PointMass>| {
             let policy = &agent.ppo.policy;
             let [actor, _] = policy.layout.nets();
@@ -302,11 +299,7 @@ fn the_first_minibatch_sees_the_very_policy_that_acted() {
             3,
         );
         for iteration in 1..=5 {
-            let stats = agent
-                .iterate(&NEVER)
-                .unwrap()
-                .expect("nothing stops it")
-                .update;
+            let stats = agent.iterate(&NEVER).unwrap().update;
             assert!(
                 stats.first.kl.abs() < 1e-5,
                 "iteration {iteration}: KL {}",
@@ -334,7 +327,7 @@ fn a_reward_that_is_not_finite_stops_the_learner_and_names_the_minibatch() {
         ..
     } = {
         let mut agent = agent(&settings(), 0);
-        agent.collect(&NEVER).unwrap().expect("nothing stops it");
+        agent.collect(&NEVER).unwrap();
         agent
     };
     rollout.blocks[2].rewards[5] = f32::NAN;
@@ -394,7 +387,7 @@ fn truncation_and_another_goal_bootstrap_from_the_final_observation_and_terminat
         .skip(1)
         .step_by(2)
         .for_each(|env| env.redirects = 7);
-    agent.collect(&NEVER).unwrap().expect("nothing stops it");
+    agent.collect(&NEVER).unwrap();
     let policy = agent.ppo.policy.freeze();
     let mut work = policy.workspace(1);
     let (mut truncated, mut redirected, mut terminated) = (0, 0, 0);
@@ -436,8 +429,9 @@ fn truncation_and_another_goal_bootstrap_from_the_final_observation_and_terminat
 #[test]
 fn an_interrupted_collection_says_so() {
     let mut agent = agent(&settings(), 1);
-    assert!(agent.collect(&AtomicBool::new(true)).unwrap().is_none());
-    assert!(agent.collect(&NEVER).unwrap().is_some());
+    let interrupted = agent.collect(&AtomicBool::new(true)).unwrap_err();
+    assert!(interrupted.is::<Interrupted>());
+    assert!(agent.collect(&NEVER).is_ok());
 }
 
 #[test]
@@ -450,7 +444,7 @@ fn pools_of_any_size_learn_the_same_bits_on_any_number_of_threads() {
                 .unwrap();
             threads.install(|| {
                 let mut agent = agent_of(envs, &settings(), 5);
-                (0..4).for_each(|_| assert!(agent.iterate(&NEVER).unwrap().is_some()));
+                (0..4).for_each(|_| assert!(agent.iterate(&NEVER).is_ok()));
                 (answer(&agent.ppo), agent.pool.take_finished())
             })
         };
@@ -473,9 +467,10 @@ fn iterations_and_steps_are_counted_where_they_are_made() {
         },
         0,
     );
-    let made = agent.iterate(&NEVER).unwrap().expect("nothing stops it");
+    let made = agent.iterate(&NEVER).unwrap();
     assert_eq!((agent.iteration, agent.env_steps, made.steps), (1, 72, 72));
-    assert!(agent.iterate(&AtomicBool::new(true)).unwrap().is_none());
+    let interrupted = agent.iterate(&AtomicBool::new(true)).unwrap_err();
+    assert!(interrupted.is::<Interrupted>());
     assert_eq!(
         (agent.iteration, agent.env_steps),
         (1, 72),

@@ -646,7 +646,7 @@ fn evaluations_stay_nominal_while_training_is_randomised() {
             episodes,
             stop: &AtomicBool::new(false),
         };
-        let played = trial.play(&mut |_| Ok(())).unwrap().unwrap();
+        let played = trial.play(&mut |_| Ok(())).unwrap();
         Score::of(&played, task.config.ctrl_dt)["rot_dist"]
     };
     assert_eq!(rot_dist(&[]), logged);

@@ -114,11 +114,7 @@ fn learnt<E: Env>(agent: &mut Agent<E>, iterations: usize) -> Learnt<E::Episode>
     let never = AtomicBool::new(false);
     let mut figures = Vec::new();
     for _ in 0..iterations {
-        let stats = agent
-            .iterate(&never)
-            .unwrap()
-            .expect("nothing stops it")
-            .update;
+        let stats = agent.iterate(&never).unwrap().update;
         figures.extend(stats.named().map(|(_, value)| value));
     }
     let policy = &agent.ppo.policy;
@@ -228,7 +224,7 @@ fn continued(
                 .unwrap();
         }
         for _ in 0..iterations {
-            agent.iterate(&AtomicBool::new(false)).unwrap().unwrap();
+            agent.iterate(&AtomicBool::new(false)).unwrap();
         }
         let mut end = Checkpoint::default();
         agent.save(&mut end);
@@ -278,7 +274,6 @@ fn evaluation_episodes_that_are_shared_out_have_the_same_results() {
             stop: &never,
         }
         .play(&mut |_| Ok(()))
-        .unwrap()
         .unwrap();
         assert_eq!(alone.len(), count);
         for ranks in [1, 4] {
@@ -291,10 +286,7 @@ fn evaluation_episodes_that_are_shared_out_have_the_same_results() {
                     episodes,
                     stop: &never,
                 };
-                trial
-                    .play_together(&exchange, &mut |_| Ok(()))
-                    .unwrap()
-                    .unwrap()
+                trial.play_together(&exchange, &mut |_| Ok(())).unwrap()
             };
             let mut together = on_ranks(ranks, 4, work);
             assert!(
@@ -309,7 +301,7 @@ fn evaluation_episodes_that_are_shared_out_have_the_same_results() {
 fn all_ranks_together_send_no_more_than_a_ring_would() {
     let work = |_, exchange: Exchange| {
         let mut agent = of_ranks(8, &settings(), 5, exchange);
-        agent.iterate(&AtomicBool::new(false)).unwrap().unwrap();
+        agent.iterate(&AtomicBool::new(false)).unwrap();
         let steps = settings().epochs * settings().minibatches;
         (
             agent.exchange.take_traffic()[1].1,

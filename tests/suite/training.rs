@@ -245,10 +245,7 @@ fn a_rollout_holds_what_the_environments_show_and_the_policy_perceives_it() {
         let task = task(&[]);
         let record = task.record().with(config.ppo.symmetry);
         let mut agent = started_agent(&task.for_policy(&record).unwrap(), &config);
-        agent
-            .collect(&AtomicBool::new(false))
-            .unwrap()
-            .expect("nothing stops it");
+        agent.collect(&AtomicBool::new(false)).unwrap();
         let (policy, mut shown) = (agent.ppo.policy.freeze(), vec![0.0; OBSERVATION_SIZE]);
         let block = &agent.rollout.blocks[0];
         let last =
@@ -397,7 +394,7 @@ fn far_from_the_goal_actions_have_a_larger_noise_that_the_losses_know() {
         env.observe(row);
     }
     let never = AtomicBool::new(false);
-    agent.collect(&never).unwrap().expect("nothing stops it");
+    agent.collect(&never).unwrap();
     let Agent { ppo, rollout, .. } = &mut agent;
     // Sum and count of the squared distances from the mean, near the goal and far from it.
     let mut spread = [[0.0; 2]; 2];
@@ -430,7 +427,7 @@ fn far_from_the_goal_actions_have_a_larger_noise_that_the_losses_know() {
             "{std} instead of {expected}, {count}"
         );
     }
-    let stats = ppo.update(rollout, 1, &never).unwrap().unwrap();
+    let stats = ppo.update(rollout, 1, &never).unwrap();
     assert!(
         stats.first.kl.abs() < 1e-5 && stats.first.ratio_error < 1e-3,
         "{stats:?}"
