@@ -485,7 +485,7 @@ fn a_training_can_end_when_evaluations_no_longer_rise_and_tells_how_far_they_ros
         .expect(&said);
     let table: Vec<&str> = end.lines().skip(1).take(4).map(str::trim).collect();
     for (line, first) in table.iter().zip([
-        "2 episodes",
+        "8 episodes",
         "goals per episode",
         "rotation error, rad",
         "drop rate, %",
