@@ -26,7 +26,6 @@ use crate::run::Histogram;
 use crate::schedule;
 use duties::{CONFIRMED_BY, Lead};
 use hints::hints;
-
 use log::histograms;
 use memory::need;
 use outcome::{Outcome, Stop};
@@ -225,7 +224,7 @@ impl Session {
                 known.iter().all(|x| x.is_finite()),
                 "run.patience: the physics of every evaluation episode diverges at once"
             );
-            self.best = Some(rank(&before));
+            self.take_down(&before);
             self.rise = Some(Rise {
                 before: known,
                 best: known,
@@ -253,10 +252,7 @@ impl Session {
         } else {
             score
         };
-        let improved = hopeful && beats(rank(&judged), self.best);
-        if improved {
-            self.best = Some(rank(&judged));
-        }
+        let improved = hopeful && self.take_down(&judged);
         // While the critic learns alone, an evaluation cannot rise.
         if !self.agent.ppo.is_critic_alone(self.agent.iteration)
             && let Some(rise) = &mut self.rise
@@ -264,6 +260,15 @@ impl Session {
             rise.add(figures(&judged));
         }
         Ok((score, improved))
+    }
+
+    /// Records a score if it is the best so far, and returns whether it is.
+    fn take_down(&mut self, score: &Score) -> bool {
+        let improved = beats(rank(score), self.best);
+        if improved {
+            self.best = Some(rank(score));
+        }
+        improved
     }
 
     /// Plays so many evaluation episodes for this purpose, and shows their score.
@@ -415,6 +420,22 @@ mod tests {
             assert_eq!((rank(&found), improved), (score, before != after));
             assert_eq!(session.best, Some(after));
         }
+    }
+
+    #[test]
+    fn an_evaluation_before_the_first_iteration_does_not_replace_a_better_best() {
+        let sets = [
+            "env.num_envs=2",
+            "ppo.hidden=[8]",
+            "run.eval_episodes=1",
+            "run.patience=1",
+        ];
+        let mut session = from_scratch(&sets.map(|set| set.parse().unwrap()));
+        // As in a resume of the first checkpoint of a run that found a better policy later.
+        session.best = Some([9.0, 0.0]);
+        session.begin(&Requests::none()).unwrap();
+        assert!(session.rise.is_some());
+        assert_eq!(session.best, Some([9.0, 0.0]));
     }
 
     #[test]
