@@ -2,7 +2,7 @@
 
 use std::process::ExitCode;
 
-use anyhow::{Result, ensure};
+use anyhow::Result;
 
 use super::browser::about;
 use super::figures::{json_score, table};
@@ -126,7 +126,7 @@ fn film(
         }
     }
     say!("{}: {}", to.path.display(), film.finish()?);
-    ensure!(played.len() == count, Interrupted);
+    anyhow::ensure!(played.len() == count, Interrupted);
     Ok(Score::of(&played, task.config.ctrl_dt))
 }
 
