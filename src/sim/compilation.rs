@@ -314,11 +314,12 @@ fn add_goal(spec: &mut MjSpec, compiled: &MjModel, name: &str, goal: &str) -> Re
         }
         let material = usize::try_from(compiled.geom_matid()[geom]).ok();
         let material = material.and_then(|id| compiled.id_to_name(mjOBJ_MATERIAL, id));
-        // It can be seen through. What has a material shows it, and the rest is green.
-        let colour = match material {
-            Some(_) => [1.0, 1.0, 1.0, 0.6],
-            None => [0.2, 0.8, 0.2, 0.4],
+        let mut colour = match material {
+            Some(_) => [1.0; 4],
+            None => compiled.geom_rgba()[geom],
         };
+        // It can be seen through.
+        colour[3] = 0.5;
         only_seen(shown)
             .with_type(kind)
             .with_material(material.unwrap_or_default())

@@ -77,8 +77,11 @@ pub fn furnished(
         return Ok(None);
     }
     let [low, high] = space_of(model, goal);
-    let lacking = [is_dark, has_no_sky, has_no_floor];
-    add_surroundings(&mut spec, lacking, low[2] - BELOW);
+    let middle = [0, 1, 2].map(|axis| 0.5 * (low[axis] + high[axis]));
+    if is_dark {
+        add_light(&mut spec, middle);
+    }
+    add_surroundings(&mut spec, [has_no_sky, has_no_floor], low[2] - BELOW);
     for (name, marks, opacity) in marked {
         let body = spec
             .body_mut(name)
@@ -88,26 +91,25 @@ pub fn furnished(
     let mut furnished = compilation.finish(spec)?;
     if has_no_camera {
         let statistics = furnished.stat_mut();
-        statistics.center = [0, 1, 2].map(|axis| 0.5 * (low[axis] + high[axis]));
+        statistics.center = middle;
         let squares: f64 = (0..3).map(|axis| (high[axis] - low[axis]).powi(2)).sum();
         statistics.extent = squares.sqrt();
     }
     Ok(Some(furnished))
 }
 
-/// Adds a light, a sky, and a floor at this height, if they are lacking.
-fn add_surroundings(
-    spec: &mut MjSpec,
-    [is_dark, has_no_sky, has_no_floor]: [bool; 3],
-    height: f64,
-) {
-    if is_dark {
-        spec.world_body_mut()
-            .add_light()
-            .with_pos([0.0, 0.0, 2.0])
-            .with_dir([0.2, 0.4, -1.0])
-            .with_type(mjLIGHT_DIRECTIONAL);
-    }
+/// Adds a light that shines through this point. MuJoCo draws no shadows far from this line.
+fn add_light(spec: &mut MjSpec, through: [f64; 3]) {
+    let direction = [0.2, 0.4, -1.0];
+    spec.world_body_mut()
+        .add_light()
+        .with_pos([0, 1, 2].map(|axis| through[axis] - 2.0 * direction[axis]))
+        .with_dir(direction)
+        .with_type(mjLIGHT_DIRECTIONAL);
+}
+
+/// Adds a sky, and a floor at this height, if they are lacking.
+fn add_surroundings(spec: &mut MjSpec, [has_no_sky, has_no_floor]: [bool; 2], height: f64) {
     if has_no_sky {
         spec.add_texture()
             .with_name("sky of shadow-repose")
@@ -146,15 +148,21 @@ fn add_marks(body: &mut MjsBody, marks: Vec<Mark>, opacity: f32) {
     }
 }
 
-/// A mark for each colour of [`FACES`]: plates on a box, dots on a round shape, and rods along the axes of anything else. An object with a
-/// material has none.
+/// A mark for each colour of [`FACES`]: plates on a box, dots on a round shape, and rods along the axes of anything else. What has a
+/// material has rods, so that its texture is seen. What has several colours needs no marks.
 fn marks(model: &MjModel, body: usize) -> Option<Vec<Mark>> {
-    let shapes = geoms_within(model, &frames_within(model, body));
+    let mut shapes = geoms_within(model, &frames_within(model, body));
+    shapes.retain(|&(geom, _)| model.geom_group()[geom] <= VISUAL);
     let &(first, place) = shapes.first()?;
+    let look = |geom: usize| (model.geom_rgba()[geom], model.geom_matid()[geom]);
+    if shapes.iter().any(|&(geom, _)| look(geom) != look(first)) {
+        return None;
+    }
     let [low, high] = box_around(model, &shapes);
     let half = [0, 1, 2].map(|axis| 0.5 * (high[axis] - low[axis]));
     let least = half.into_iter().fold(f64::INFINITY, f64::min);
-    let is_simple = shapes.len() == 1 && place == ([0.0; 3], quat::IDENTITY);
+    let is_centred = place == ([0.0; 3], quat::IDENTITY);
+    let is_simple = shapes.len() == 1 && is_centred && model.geom_matid()[first] < 0;
     let mark = |face: usize| {
         let axis = face / 2;
         let (kind, size, distance, orientation) = match model.geom_type()[first] {
@@ -183,9 +191,7 @@ fn marks(model: &MjModel, body: usize) -> Option<Vec<Mark>> {
         };
         (kind, size, position, orientation)
     };
-    let mut shapes = shapes.iter();
-    let is_plain = shapes.all(|&(geom, _)| model.geom_matid()[geom] < 0);
-    is_plain.then(|| (0..FACES.len()).map(mark).collect())
+    Some((0..FACES.len()).map(mark).collect())
 }
 
 /// The corners of a box along the axes around shapes that have these places, m.
@@ -239,4 +245,32 @@ fn space_of(model: &MjModel, goal: [f64; 3]) -> [[f64; 3]; 2] {
         high[axis] = high[axis].max(goal[axis] + GOAL);
     }
     [low, high]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::Cone;
+    use super::*;
+
+    #[test]
+    fn the_light_of_a_scene_without_one_shines_on_what_moves_so_that_it_has_a_shadow() {
+        let text = "<mujoco><worldbody><body pos='3 1 2'><freejoint/><geom size='.1'/></body></worldbody></mujoco>";
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("scene.xml");
+        std::fs::write(&file, text).unwrap();
+        let compilation = Compilation::plain(0.01, Cone::Scene);
+        let model = compilation.compile(Some(&file)).unwrap();
+        let shown = furnished(&file, &model, &compilation, [3.0, 1.0, 2.5])
+            .unwrap()
+            .unwrap();
+        let centre = shown.stat().center;
+        assert!((centre[0] - 3.0).abs() < 1e-9 && (1.9..2.6).contains(&centre[2]));
+        let [from, along] = [shown.light_pos()[0], shown.light_dir()[0]];
+        let length = quat::length(&along);
+        let way = [0, 1, 2].map(|axis| centre[axis] - from[axis]);
+        let distance = quat::length(&way);
+        for axis in 0..3 {
+            assert!((way[axis] / distance - along[axis] / length).abs() < 1e-6);
+        }
+    }
 }

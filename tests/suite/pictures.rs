@@ -444,7 +444,15 @@ fn the_sides_of_any_object_and_of_its_goal_can_be_told_apart_and_a_camera_frames
         ("<geom type=\"cylinder\" size=\".03 .02\"".into(), 12),
         ("<geom type=\"mesh\" mesh=\"part\"".into(), 12),
         (format!("<geom type=\"sphere\" size=\".01\"/>{shape}"), 12),
-        (format!("{shape} material=\"own\""), 0),
+        (format!("{shape} material=\"own\""), 12),
+        (
+            format!("<geom type=\"sphere\" size=\".01\" rgba=\"1 0 0 1\"/>{shape}"),
+            0,
+        ),
+        (
+            format!("<geom type=\"sphere\" size=\".01\" rgba=\"1 0 0 1\" group=\"3\"/>{shape}"),
+            12,
+        ),
     ] {
         let assets = mesh.replace("<mesh", "<material name=\"own\"/><mesh");
         let text = scene.replace(shape, &other).replace("<worldbody>", &assets);
