@@ -9,7 +9,7 @@ use toml::{Table, Value};
 
 use crate::cli::ExportArgs;
 use crate::config::{EnvConfig, expect_used};
-use crate::evaluate::expect_finite_actions;
+use crate::evaluate::expect_finite;
 use crate::load::Loaded;
 use crate::os::{self, say};
 use crate::ppo::Checkpoint;
@@ -29,7 +29,7 @@ pub fn export(args: &ExportArgs) -> Result<()> {
         .context("the file needs the actuator ranges of the scene")?;
     task.say_warnings();
     task.notes().iter().for_each(|note| say!("note: {note}"));
-    expect_finite_actions(&task, &loaded.policy)
+    expect_finite(&task, &loaded.policy, false)
         .with_context(|| format!("cannot export {}", loaded.origin))?;
     run::expect_output(&args.out, loaded.origin.file(), task.config.model_file())?;
     let parts = &task.hand.parts;

@@ -10,7 +10,7 @@ use super::start::{Plan, Takes};
 use crate::agent::Agent;
 use crate::cli::TrainArgs;
 use crate::config::{Config, Source};
-use crate::evaluate::{expect_finite_actions, expect_finite_values};
+use crate::evaluate::expect_finite;
 use crate::os::{self, say};
 use crate::ppo::{Checkpoint, Rise};
 use crate::ranks::Exchange;
@@ -137,8 +137,7 @@ impl Session {
         let agent = &mut self.agent;
         if let Takes::Policy = takes {
             agent.ppo.begin_with(&checkpoint)?;
-            expect_finite_actions(&self.task, &agent.ppo.policy)?;
-            return expect_finite_values(&self.task, &agent.ppo.policy);
+            return expect_finite(&self.task, &agent.ppo.policy, true);
         }
         agent.restore(&mut checkpoint)?;
         if let Takes::Fork = takes {
