@@ -218,6 +218,7 @@ impl RunTable {
             table,
         })
     }
+
     /// The curve of a metric, without points if the run has no such column. Each evaluation counts by itself, at the step at which it
     /// was made. Other values are averaged over windows of so many steps.
     fn curve(&self, name: &str, window: f64) -> Curve {

@@ -9,7 +9,6 @@ use anyhow::{Context, Result, bail};
 use crate::check::Check;
 use crate::cli::{Made, ViewArgs, expect_together, usage_error};
 use crate::config::{Config, Settings, expect_used};
-
 use crate::evaluate::{Actor, Player};
 use crate::os::{self, say};
 use crate::repose::Task;

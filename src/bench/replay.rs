@@ -105,6 +105,7 @@ impl RecordingEnv {
 impl Env for RecordingEnv {
     type Episode = EpisodeStats;
     type Lesson = Lesson;
+
     fn spaces(&self) -> Spaces {
         self.env.spaces()
     }

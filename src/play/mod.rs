@@ -14,7 +14,6 @@ use anyhow::{Result, bail};
 pub use self::figures::json_score;
 
 use self::browser::Followed;
-
 use self::plan::Plan;
 use self::score::score;
 use self::stage::{Stage, task};

@@ -204,6 +204,7 @@ impl Repose {
 impl Env for Repose {
     type Episode = EpisodeStats;
     type Lesson = Lesson;
+
     fn spaces(&self) -> Spaces {
         self.task.spaces()
     }

@@ -147,7 +147,6 @@ impl Hand {
 fn shadow_hand(scene: &Scene) -> Option<Parts> {
     let joints = scene.joints();
     let actuators = scene.actuators();
-
     let with =
         |names: &[&str], prefix: &str| names.iter().map(|name| format!("{prefix}{name}")).collect();
     joints

@@ -38,8 +38,7 @@ pub struct Held {
     settings: String,
     /// The options with which this training run is resumed.
     options: String,
-    /// The state at the end of the last complete iteration.
-    /// The state that is saved.
+    /// The state that is saved: at the end of the last complete iteration.
     pub last: Arc<Checkpoint>,
     /// Whether this session has written into the folder.
     pub wrote: bool,
