@@ -154,8 +154,7 @@ fn marks(model: &MjModel, body: usize) -> Option<Vec<Mark>> {
     let mut shapes = geoms_within(model, &frames_within(model, body));
     shapes.retain(|&(geom, _)| model.geom_group()[geom] <= VISUAL);
     let &(first, place) = shapes.first()?;
-    let look = |geom: usize| (model.geom_rgba()[geom], model.geom_matid()[geom]);
-    if shapes.iter().any(|&(geom, _)| look(geom) != look(first)) {
+    if !look_alike(model, &shapes) {
         return None;
     }
     let [low, high] = box_around(model, &shapes);
@@ -192,6 +191,12 @@ fn marks(model: &MjModel, body: usize) -> Option<Vec<Mark>> {
         (kind, size, position, orientation)
     };
     Some((0..FACES.len()).map(mark).collect())
+}
+
+/// Whether these shapes have the same colour and material.
+fn look_alike(model: &MjModel, shapes: &[(usize, Placed)]) -> bool {
+    let look = |(geom, _): (usize, Placed)| (model.geom_rgba()[geom], model.geom_matid()[geom]);
+    shapes.iter().all(|&shape| look(shape) == look(shapes[0]))
 }
 
 /// The corners of a box along the axes around shapes that have these places, m.
@@ -257,7 +262,7 @@ mod tests {
         let text = "<mujoco><worldbody><body pos='3 1 2'><freejoint/><geom size='.1'/></body></worldbody></mujoco>";
         let folder = tempfile::tempdir().unwrap();
         let file = folder.path().join("scene.xml");
-        std::fs::write(&file, text).unwrap();
+        crate::os::write_whole(&file, text.as_bytes()).unwrap();
         let compilation = Compilation::plain(0.01, Cone::Scene);
         let model = compilation.compile(Some(&file)).unwrap();
         let shown = furnished(&file, &model, &compilation, [3.0, 1.0, 2.5])
