@@ -154,49 +154,48 @@ fn marks(model: &MjModel, body: usize) -> Option<Vec<Mark>> {
     let mut shapes = geoms_within(model, &frames_within(model, body));
     shapes.retain(|&(geom, _)| model.geom_group()[geom] <= VISUAL);
     let &(first, place) = shapes.first()?;
-    if !look_alike(model, &shapes) {
+    let look = |geom: usize| (model.geom_rgba()[geom], model.geom_matid()[geom]);
+    if shapes.iter().any(|&(geom, _)| look(geom) != look(first)) {
         return None;
     }
-    let [low, high] = box_around(model, &shapes);
-    let half = [0, 1, 2].map(|axis| 0.5 * (high[axis] - low[axis]));
-    let least = half.into_iter().fold(f64::INFINITY, f64::min);
     let is_centred = place == ([0.0; 3], quat::IDENTITY);
     let is_simple = shapes.len() == 1 && is_centred && model.geom_matid()[first] < 0;
-    let mark = |face: usize| {
-        let axis = face / 2;
-        let (kind, size, distance, orientation) = match model.geom_type()[first] {
-            mjGEOM_BOX if is_simple => {
-                let mut size = half.map(|half| 0.88 * half);
-                size[axis] = PLATE * half[axis];
-                (mjGEOM_BOX, size, half[axis], quat::IDENTITY)
-            }
-            mjGEOM_SPHERE | mjGEOM_ELLIPSOID | mjGEOM_CAPSULE | mjGEOM_CYLINDER if is_simple => {
-                let [radius, height, depth] = DOT.map(|part| part * least);
-                let mut size = [radius; 3];
-                size[axis] = height;
-                (mjGEOM_ELLIPSOID, size, half[axis] - depth, quat::IDENTITY)
-            }
-            _ => {
-                let middle = 0.5 * (half[axis] + ROD[0] * least);
-                let size = [ROD[1] * least, middle, 0.0];
-                (mjGEOM_CAPSULE, size, middle, ALONG[axis])
-            }
-        };
-        let mut position = [0, 1, 2].map(|axis| low[axis] + half[axis]);
-        position[axis] += if face.is_multiple_of(2) {
-            distance
-        } else {
-            -distance
-        };
-        (kind, size, position, orientation)
-    };
-    Some((0..FACES.len()).map(mark).collect())
+    let kind = is_simple.then(|| model.geom_type()[first]);
+    let corners = box_around(model, &shapes);
+    let faces = 0..FACES.len();
+    Some(faces.map(|face| mark(kind, corners, face)).collect())
 }
 
-/// Whether these shapes have the same colour and material.
-fn look_alike(model: &MjModel, shapes: &[(usize, Placed)]) -> bool {
-    let look = |(geom, _): (usize, Placed)| (model.geom_rgba()[geom], model.geom_matid()[geom]);
-    shapes.iter().all(|&shape| look(shape) == look(shapes[0]))
+/// The mark of this face on a simple shape of this kind, or on anything else, in a box with these corners.
+fn mark(kind: Option<MjtGeomBase>, [low, high]: [[f64; 3]; 2], face: usize) -> Mark {
+    let axis = face / 2;
+    let half = [0, 1, 2].map(|axis| 0.5 * (high[axis] - low[axis]));
+    let least = half.into_iter().fold(f64::INFINITY, f64::min);
+    let (kind, size, distance, orientation) = match kind {
+        Some(mjGEOM_BOX) => {
+            let mut size = half.map(|half| 0.88 * half);
+            size[axis] = PLATE * half[axis];
+            (mjGEOM_BOX, size, half[axis], quat::IDENTITY)
+        }
+        Some(mjGEOM_SPHERE | mjGEOM_ELLIPSOID | mjGEOM_CAPSULE | mjGEOM_CYLINDER) => {
+            let [radius, height, depth] = DOT.map(|part| part * least);
+            let mut size = [radius; 3];
+            size[axis] = height;
+            (mjGEOM_ELLIPSOID, size, half[axis] - depth, quat::IDENTITY)
+        }
+        _ => {
+            let middle = 0.5 * (half[axis] + ROD[0] * least);
+            let size = [ROD[1] * least, middle, 0.0];
+            (mjGEOM_CAPSULE, size, middle, ALONG[axis])
+        }
+    };
+    let mut position = [0, 1, 2].map(|axis| low[axis] + half[axis]);
+    position[axis] += if face.is_multiple_of(2) {
+        distance
+    } else {
+        -distance
+    };
+    (kind, size, position, orientation)
 }
 
 /// The corners of a box along the axes around shapes that have these places, m.
