@@ -24,7 +24,7 @@ use super::constants::*;
 use super::fatal::quieten_mujoco;
 use super::files::{SceneFiles, scene_files};
 use super::fingerprint::fingerprint;
-use super::placing::{frames_within, geoms_within};
+use super::placing::{colour_of, frames_within, geoms_within};
 use crate::quat;
 
 /// The group of geoms that are drawn and by convention collide with nothing.
@@ -314,10 +314,7 @@ fn add_goal(spec: &mut MjSpec, compiled: &MjModel, name: &str, goal: &str) -> Re
         }
         let material = usize::try_from(compiled.geom_matid()[geom]).ok();
         let material = material.and_then(|id| compiled.id_to_name(mjOBJ_MATERIAL, id));
-        let mut colour = match material {
-            Some(_) => [1.0; 4],
-            None => compiled.geom_rgba()[geom],
-        };
+        let mut colour = colour_of(compiled, geom);
         // It can be seen through.
         colour[3] = 0.5;
         only_seen(shown)

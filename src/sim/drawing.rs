@@ -8,6 +8,7 @@ use serde_json::{Value, json};
 use super::Scene;
 use super::constants::*;
 use super::look::{Camera, HIDDEN, is_of};
+use super::placing::colour_of;
 use crate::draw::Mesh;
 
 /// A scene as a page draws it. Lengths in m, quaternions w, x, y, z.
@@ -26,9 +27,6 @@ pub struct Drawing {
 
 /// The most corners of a part of a mesh, which a page numbers in 16 bits.
 const MOST_CORNERS: usize = 65_535;
-
-/// The colour of a shape that has none.
-const UNCOLOURED: [f32; 4] = [0.5, 0.5, 0.5, 1.0];
 
 impl Scene {
     /// What a page needs to draw this scene, perhaps from this camera. `dressed` is the beginning of the names of the bodies that
@@ -156,18 +154,13 @@ fn drawn_geom(model: &MjModel, geom: usize, dressed: Option<&str>) -> Option<Val
     }
     let material = usize::try_from(model.geom_matid()[geom]).ok();
     let shine = |of: &[f32]| material.map_or(0.5, |material| of[material]);
-    // As MuJoCo draws it: a colour of the shape's own goes before the material's.
-    let own = model.geom_rgba()[geom];
-    let of_material = material
-        .filter(|_| own == UNCOLOURED)
-        .map(|material| model.mat_rgba()[material]);
     let mut drawn = json!({
         "type": kind,
         "body": model.geom_bodyid()[geom],
         "size": model.geom_size()[geom],
         "pos": model.geom_pos()[geom],
         "quat": model.geom_quat()[geom],
-        "rgba": of_material.unwrap_or(own),
+        "rgba": colour_of(model, geom),
         "specular": shine(model.mat_specular()),
         "shininess": shine(model.mat_shininess()),
     });

@@ -1,4 +1,4 @@
-//! The places of the parts of a body in its frame, and which of them can touch anything.
+//! The places of the parts of a body in its frame, which of them can touch anything, and their colours.
 
 use mujoco_rs::prelude::MjModel;
 
@@ -48,4 +48,16 @@ pub fn touches(model: &MjModel, geom: usize) -> bool {
         || model.geom_conaffinity()[geom] != 0
         || model.pair_geom1().contains(&id)
         || model.pair_geom2().contains(&id)
+}
+
+/// The colour of a shape that has none.
+const UNCOLOURED: [f32; 4] = [0.5, 0.5, 0.5, 1.0];
+
+/// The colour of a shape as MuJoCo draws it: one of its own goes before the material's.
+pub fn colour_of(model: &MjModel, geom: usize) -> [f32; 4] {
+    let own = model.geom_rgba()[geom];
+    match usize::try_from(model.geom_matid()[geom]) {
+        Ok(material) if own == UNCOLOURED => model.mat_rgba()[material],
+        _ => own,
+    }
 }

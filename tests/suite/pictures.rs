@@ -483,6 +483,44 @@ fn the_sides_of_any_object_and_of_its_goal_can_be_told_apart_and_a_camera_frames
 }
 
 #[test]
+fn a_goal_that_is_added_has_the_colour_of_the_object_or_of_its_material() {
+    let scene = include_str!("three_fingers.xml");
+    let shape = "<geom type=\"box\" size=\".025 .025 .03\"";
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("scene.xml");
+    let assets = "<asset><material name=\"own\" rgba=\".7 .2 .1 1\"/></asset><worldbody>";
+    for (look, expected) in [
+        ("material=\"own\"", [0.7, 0.2, 0.1, 0.5]),
+        ("rgba=\".3 .4 .6 1\"", [0.3, 0.4, 0.6, 0.5]),
+        ("material=\"own\" rgba=\".3 .4 .6 1\"", [0.3, 0.4, 0.6, 0.5]),
+    ] {
+        let text = scene
+            .replace(shape, &format!("{shape} {look}"))
+            .replace("<worldbody>", assets);
+        std::fs::write(&path, text).unwrap();
+        let shown = task(&[&format!("env.model={}", path.display())])
+            .for_display(&Look {
+                dress: None,
+                size: [64, 64],
+                camera: None,
+                quality: Quality::Fast,
+                plain: false,
+            })
+            .unwrap();
+        let drawing = shown.scene.drawing(None, None).scene;
+        let is_goal = |geom: &&serde_json::Value| geom["rgba"][3] == 0.5;
+        let mut geoms = drawing["geoms"].as_array().unwrap().iter();
+        let goal = geoms
+            .find(is_goal)
+            .expect("a shape that can be seen through");
+        for (channel, expected) in expected.into_iter().enumerate() {
+            let found = goal["rgba"][channel].as_f64().unwrap();
+            assert!((found - expected).abs() < 1e-6, "{look}: {}", goal["rgba"]);
+        }
+    }
+}
+
+#[test]
 fn meshes_that_are_no_meshes_are_an_error_with_their_name() {
     let look = Look {
         dress: Some(dress("rh_", vec![b"rubbish".to_vec(); mesh_files().len()])),
