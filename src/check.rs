@@ -10,6 +10,7 @@ use crate::env::Env;
 use crate::quat;
 use crate::repose::{Repose, Task};
 use crate::rng;
+use crate::statistics::mean;
 
 /// The number of episodes, and their steps. In the first ones the object settles.
 const EPISODES: u64 = 16;
@@ -120,14 +121,14 @@ fn found(task: &Arc<Task>) -> [f64; 5] {
         episodes.map(|episode| play(task, episode, std)).collect()
     });
     let drops = |played: &[Played]| played.iter().filter(|one| one.dropped).count() as f64;
-    let tilts: Vec<f64> = still.iter().filter_map(|one| one.tilt).collect();
+    let tilts = Vec::from_iter(still.iter().filter_map(|one| one.tilt));
     let tips = 0..task.hand.fingertips.len();
     let reached = tips.filter(|&tip| random.iter().any(|one| one.near[tip]));
     let [turned, steps] = [|one: &Played| one.turned, |one: &Played| one.steps]
         .map(|value| random.iter().map(value).sum::<f64>());
     [
         EPISODES as f64 - drops(&still),
-        (tilts.iter().sum::<f64>() / tilts.len() as f64).to_degrees(),
+        mean(&tilts).to_degrees(),
         reached.count() as f64,
         100.0 * turned / steps,
         drops(&random),

@@ -7,6 +7,7 @@ use serde_json::{Value, json};
 use crate::config::EnvConfig;
 use crate::env::Env;
 use crate::evaluate::Moment;
+use crate::statistics::{line, mean, percentile};
 
 /// The goals reached in a set of episodes, and their early drops.
 pub struct GoalTimes {
@@ -83,7 +84,7 @@ impl GoalTimes {
         steps.sort_by(f64::total_cmp);
         let at = |fraction: f64| percentile(&steps, fraction);
         let to_goal = json!({
-            "mean": steps.iter().sum::<f64>() / steps.len() as f64,
+            "mean": mean(&steps),
             "p10": at(0.1), "p50": at(0.5), "p90": at(0.9), "p99": at(0.99),
         });
         let turning = |goal: &Goal| [goal.angle, f64::from(goal.steps) - f64::from(self.hold)];
@@ -97,30 +98,6 @@ impl GoalTimes {
             ("steps_fit", json!({ "settle": offset, "per_rad": slope })),
         ]
     }
-}
-
-/// The value below which the `fraction` of the `sorted` values lies, interpolated linearly, or `NaN` if there are none.
-fn percentile(sorted: &[f64], fraction: f64) -> f64 {
-    let place = fraction * sorted.len().saturating_sub(1) as f64;
-    let below = place as usize;
-    let [low, high] =
-        [below, below + 1].map(|i| sorted.get(i).or(sorted.last()).copied().unwrap_or(f64::NAN));
-    low + place.fract() * (high - low)
-}
-
-/// Fits the least-squares line y(x), and returns its offset and slope, or `NaN` for fewer than two distinct x.
-fn line(points: impl Iterator<Item = [f64; 2]> + Clone) -> [f64; 2] {
-    let count = points.clone().count() as f64;
-    let mean = |of: &dyn Fn([f64; 2]) -> f64| points.clone().map(of).sum::<f64>() / count;
-    let x_mean = mean(&|[x, _]| x);
-    let y_mean = mean(&|[_, y]| y);
-    let spread = mean(&|[x, _]| (x - x_mean).powi(2));
-    let slope = if spread > 0.0 {
-        mean(&|[x, y]| (x - x_mean) * (y - y_mean)) / spread
-    } else {
-        f64::NAN
-    };
-    [y_mean - slope * x_mean, slope]
 }
 
 #[cfg(test)]

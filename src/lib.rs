@@ -18,18 +18,18 @@
 //! | `processor` | the sentence about a processor that MuJoCo cannot run on; of the program only | - |
 //! | [`mod@train`] | the training loop: collect, learn, evaluate, report, save | agent, check, cli, config, evaluate, load, os, ppo, ranks, repose, run, schedule, sim, tags |
 //! | [`mod@play`] | plays a policy: in a window or a browser, as a film or an HTML file, or for its score as a table or JSON | cli, config, evaluate, goal_times, load, os, ppo, repose, robustness, run, see, sim, trace |
-//! | [`mod@check`] | whether a hand can learn at all, before it is trained | config, env, quat, repose, rng |
-//! | [`mod@robustness`] | the score of a policy under changed physics, noise and delays | config, draw, evaluate, os, repose |
+//! | [`mod@check`] | whether a hand can learn at all, before it is trained | config, env, quat, repose, rng, statistics |
+//! | [`mod@robustness`] | the score of a policy under changed physics, noise and delays | config, draw, evaluate, os, repose, statistics |
 //! | [`mod@view`] | shows the scene without a policy, and checks it | check, cli, config, evaluate, os, repose, run, see, sim |
 //! | [`mod@export`] | a policy as an ONNX file | cli, config, evaluate, load, os, ppo, repose, run, spaces |
-//! | [`mod@plot`] | learning curves of runs | cli, draw, os, run, tags |
-//! | [`mod@runs`] | a table of run folders; two of them compared | cli, config, os, run |
+//! | [`mod@plot`] | learning curves of runs | cli, draw, os, run, statistics, tags |
+//! | [`mod@runs`] | a table of run folders; two of them compared | cli, config, os, run, statistics |
 //! | [`mod@bench`] | the speed of this machine | agent, cli, config, env, os, ppo, ranks, repose, rng, schedule, sim, spaces |
 //! | [`manual`] | shell completions and a manual page | cli, os |
 //! | [`cli`] | the structure of the command line | config, evaluate, os, sim |
 //! | [`see`] | rendering of the task: window, film, picture, page | draw, env, evaluate, os, repose, sim |
 //! | [`trace`] | episodes as JSON lines | env, evaluate, repose |
-//! | [`goal_times`] | statistics of the time to reach a goal | config, env, evaluate |
+//! | [`goal_times`] | the time to reach a goal | config, env, evaluate, statistics |
 //! | [`agent`] | environments, learner and rollout; one iteration of training | config, env, os, ppo, ranks, repose, schedule, spaces |
 //! | [`load`] | checkpoints and policies from untrusted files | config, evaluate, os, ppo, repose, run, sim |
 //! | [`mod@evaluate`] | whole episodes under one policy, the basis of scores | env, os, ppo, ranks, repose, rng, schedule, sim, spaces |
@@ -46,6 +46,7 @@
 //! | [`spaces`] | what a learner needs to know about observations and actions | - |
 //! | [`schedule`] | blocks of work on all threads, over many rounds without a barrier | - |
 //! | [`quat`] | rotations | - |
+//! | [`statistics`] | means, percentiles, lines | - |
 //! | [`rng`] | random generators named by (seed, purpose, index) | - |
 //!
 //! `env` and `ppo` do not depend on each other. They are combined in `agent`, `evaluate` and the modules above. `run` depends
@@ -104,6 +105,7 @@ pub mod schedule;
 pub mod see;
 pub mod sim;
 pub mod spaces;
+pub mod statistics;
 pub mod tags;
 pub mod trace;
 pub mod train;

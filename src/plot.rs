@@ -11,6 +11,7 @@ use crate::cli::{Along, PlotArgs};
 use crate::draw::{Chart, Curve, Picture, PictureFile, Subplot};
 use crate::os::{say, similar};
 use crate::run::{self, MetricsTable, value_at};
+use crate::statistics::mean;
 use crate::tags::tag;
 
 /// A metric, and what is drawn instead where no run has its values.
@@ -243,7 +244,7 @@ impl RunTable {
 /// The mean of these curves and the band from the lowest to the highest, where all of them have values. The points are those of the
 /// first curve, and the others are interpolated linearly.
 fn mean_and_band(curves: &[Curve]) -> Curve {
-    let mut mean = Curve {
+    let mut all = Curve {
         dots: curves.iter().any(|curve| curve.dots),
         ..Curve::default()
     };
@@ -252,15 +253,14 @@ fn mean_and_band(curves: &[Curve]) -> Curve {
         let Some(values) = values.collect::<Option<Vec<f64>>>() else {
             continue;
         };
+        all.points.push([x, mean(&values)]);
         let values = values.iter().copied();
-        mean.points
-            .push([x, values.clone().sum::<f64>() / curves.len() as f64]);
-        mean.band.push([
+        all.band.push([
             values.clone().fold(f64::INFINITY, f64::min),
             values.fold(f64::NEG_INFINITY, f64::max),
         ]);
     }
-    mean
+    all
 }
 
 /// The numbers of consecutive rows that lie in the same window of this many steps.
@@ -304,12 +304,12 @@ fn smooth(along: &[f64], values: &[f64], lengths: &[usize]) -> Vec<[f64; 2]> {
     let means = lengths.iter().filter_map(|length| {
         let window = begin..begin + length;
         begin = window.end;
-        let mean = |all: &[f64]| {
+        let known = |all: &[f64]| {
             let mut known = all[window.clone()].to_vec();
             known.retain(|value| value.is_finite());
-            (!known.is_empty()).then(|| known.iter().sum::<f64>() / known.len() as f64)
+            (!known.is_empty()).then(|| mean(&known))
         };
-        Some([mean(along)?, mean(values)?])
+        Some([known(along)?, known(values)?])
     });
     means.collect()
 }

@@ -12,6 +12,7 @@ use crate::draw::{self, BarChart, Picture, PictureFile};
 use crate::evaluate::{Actor, Episodes, Trial};
 use crate::os::{self, Destination, Interrupted, Requests, number, say};
 use crate::repose::{Score, Task, measure};
+use crate::statistics::mean;
 
 /// Single changes: the start of the name of a row, the setting, and its values.
 const CHANGES: [(&str, &str, &[&str]); 9] = [
@@ -220,13 +221,12 @@ fn conditions() -> Vec<Condition> {
 
 /// The mean fraction of goals over the single changes, each counted as at most 1.
 fn mean_kept(rows: &[Scored]) -> f64 {
-    let kept: Vec<f64> = rows
+    let kept = rows
         .iter()
         .skip(1)
         .filter(|row| !row.condition.is_in_grid())
-        .map(|row| if row.kept > 1.0 { 1.0 } else { row.kept })
-        .collect();
-    kept.iter().sum::<f64>() / kept.len() as f64
+        .map(|row| if row.kept > 1.0 { 1.0 } else { row.kept });
+    mean(&Vec::from_iter(kept))
 }
 
 fn as_json(rows: &[Scored], episodes: usize, seed: u64, checkpoint: &str) -> Value {

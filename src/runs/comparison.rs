@@ -9,6 +9,7 @@ use super::found::Run;
 use crate::config::{Difference, is_derived, short};
 use crate::os::{aligned, harmless, number};
 use crate::run::{read_metrics, value_at};
+use crate::statistics::mean;
 
 /// The most steps at which figures are compared.
 const MOST_MARKS: usize = 12;
@@ -152,10 +153,9 @@ fn marks([a, b]: &[Curves; 2]) -> Vec<f64> {
 
 /// The mean of the values after `begin` up to `end`, or NaN if there are none.
 fn mean_between(points: &[[f64; 2]], begin: f64, end: f64) -> f64 {
-    let inside: Vec<f64> = points
+    let inside = points
         .iter()
         .filter(|[step, _]| *step > begin && *step <= end)
-        .map(|[_, value]| *value)
-        .collect();
-    inside.iter().sum::<f64>() / inside.len() as f64
+        .map(|[_, value]| *value);
+    mean(&Vec::from_iter(inside))
 }

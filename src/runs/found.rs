@@ -9,6 +9,7 @@ use serde_json::{Value, json};
 use crate::config::{Config, Difference, Source, is_derived, short};
 use crate::os::{self, Hold, Stamp, count, harmless, number, of_all, span};
 use crate::run::{Glance, read_metrics};
+use crate::statistics::mean;
 
 /// The last rows of a table over which its speed is averaged.
 const LAST: usize = 20;
@@ -213,7 +214,7 @@ impl Figures {
             let goals = known(goals);
             Ok(Self {
                 env_steps: Some(steps.last().map_or(0, |steps| *steps as u64)),
-                steps_per_s: speeds.iter().sum::<f64>() / speeds.len() as f64,
+                steps_per_s: mean(&speeds),
                 goals: *goals.last().unwrap_or(&unknown),
                 best_goals: goals.into_iter().fold(unknown, f64::max),
                 ..none.clone()
