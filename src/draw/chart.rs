@@ -144,11 +144,10 @@ impl PictureFile {
             "png" if !cfg!(feature = "video") => {
                 bail!("{path}: PNG needs the cargo feature `video`; .svg does not")
             }
-            "svg" | "png" => Ok(Self {
+            ending => Ok(Self {
                 output: OutputFile::create(&to.path)?,
-                ending: to.ending,
+                ending,
             }),
-            other => bail!("{path}: a chart is an .svg or a .png, not a .{other}"),
         }
     }
 }
