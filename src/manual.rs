@@ -8,6 +8,9 @@ use crate::os;
 
 const PROGRAM: &str = "shadow-repose";
 
+/// The beginning of a line for fish that completes words after a command, whose name follows.
+const FISH: &str = "complete -c shadow-repose -f -n \"__fish_shadow_repose_using_subcommand";
+
 /// Prints completions for a shell.
 ///
 /// # Errors
@@ -21,40 +24,16 @@ pub fn completions(shell: Shell) -> Result<()> {
     let mut text = Vec::new();
     clap_complete::generate(shell, &mut program, name, &mut text);
     let text = String::from_utf8(text)?;
+    let commands = program.get_subcommands().map(clap::Command::get_name);
+    let commands = Vec::from_iter(commands).join(" ");
     os::print(&match shell {
-        Shell::Bash => text.replace(" shadow_repose\n", &format!(" {PROGRAM}\n")),
-        Shell::Fish => text + &after_commands(&program),
+        Shell::Bash => text.replace(" shadow_repose\n", " shadow-repose\n"),
+        // clap_complete 4.6 leaves out the values of arguments without an option, and the commands after `help`.
+        Shell::Fish => format!(
+            "{text}{FISH} completions\" -a \"bash elvish fish powershell zsh\"\n{FISH} help\" -a \"{commands}\"\n"
+        ),
         _ => text,
     })
-}
-
-/// What clap_complete 4.6 leaves out for fish: the values of arguments without an option, and the commands after `help`.
-fn after_commands(program: &clap::Command) -> String {
-    let names = program
-        .get_subcommands()
-        .map(|command| command.get_name().to_owned())
-        .collect();
-    let values = |command: &clap::Command| -> Vec<String> {
-        command
-            .get_positionals()
-            .flat_map(clap::Arg::get_possible_values)
-            .map(|value| value.get_name().to_owned())
-            .collect()
-    };
-    let commands = program
-        .get_subcommands()
-        .map(|command| (command.get_name(), values(command)));
-    let line = |(name, words): (_, Vec<_>)| {
-        let words = words.join(" ");
-        format!(
-            "complete -c {PROGRAM} -n \"__fish_shadow_repose_using_subcommand {name}\" -f -a \"{words}\"\n"
-        )
-    };
-    commands
-        .chain([("help", names)])
-        .filter(|(_, words)| !words.is_empty())
-        .map(line)
-        .collect()
 }
 
 /// Prints a manual page of all commands.
