@@ -9,7 +9,7 @@ use anyhow::{Result, bail, ensure};
 
 use crate::cli::{Along, PlotArgs};
 use crate::draw::{Chart, Curve, Picture, PictureFile, Subplot};
-use crate::os::{say, similar};
+use crate::os::{say, shortened, similar};
 use crate::run::{self, MetricsTable, value_at};
 use crate::statistics::mean;
 use crate::tags::tag;
@@ -185,12 +185,11 @@ fn expect_columns(runs: &[RunTable], metrics: &[String]) -> Result<()> {
             let known: BTreeSet<&String> = runs.iter().flat_map(|run| &run.table.names).collect();
             let mut nearest = similar(name, known.into_iter().map(String::as_str), '/');
             nearest.truncate(SUGGESTIONS);
-            let name: String = name.chars().take(64).collect();
             let hint = match &nearest[..] {
                 [] => "the first line of metrics.csv names all columns".to_owned(),
                 nearest => format!("did you mean {}?", nearest.join(" or ")),
             };
-            bail!("no run has a column {name}; {hint}");
+            bail!("no run has a column {}; {hint}", shortened(name));
         }
         if !lacking.is_empty() {
             say!("warning: no column {name} in {}", lacking.join(", "));

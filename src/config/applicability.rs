@@ -17,9 +17,8 @@ pub fn expect_used(overrides: &[Override], command: &str) -> Result<()> {
             let known = lookup(&DEFAULTS, &name).is_some();
             let users = users(&name);
             if known && !users.contains(&command) {
-                let does = if users.len() == 1 { "does" } else { "do" };
                 let users = users.join("` and `");
-                bail!("--set {key}={value}: `{command}` does not use {name}; `{users}` {does}");
+                bail!("--set {key}={value}: `{command}` does not use {name}; `{users}` can");
             }
         }
     }

@@ -2,7 +2,7 @@
 
 use std::iter;
 
-use anyhow::{Context, Result, bail, ensure};
+use anyhow::{Context, Result, ensure};
 use plotters::coord::Shift;
 use plotters::coord::types::RangedCoordf64;
 use plotters::element::DashedPathElement;
@@ -137,18 +137,17 @@ impl PictureFile {
     /// Opens the file.
     ///
     /// # Errors
-    /// Fails if it is neither an SVG nor a PNG, for a PNG without the feature `video`, or if it cannot be written to.
+    /// Fails for a PNG without the feature `video`, or if the file cannot be written to.
     pub fn create(to: &Destination) -> Result<Self> {
-        let path = to.path.display();
-        match to.ending {
-            "png" if !cfg!(feature = "video") => {
-                bail!("{path}: PNG needs the cargo feature `video`; .svg does not")
-            }
-            ending => Ok(Self {
-                output: OutputFile::create(&to.path)?,
-                ending,
-            }),
-        }
+        ensure!(
+            to.ending != "png" || cfg!(feature = "video"),
+            "{}: PNG needs the cargo feature `video`; .svg does not",
+            to.path.display()
+        );
+        Ok(Self {
+            output: OutputFile::create(&to.path)?,
+            ending: to.ending,
+        })
     }
 }
 
