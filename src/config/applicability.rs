@@ -49,13 +49,13 @@ mod tests {
             expect_used(&[set.parse().unwrap()], command).map_err(|error| error.to_string())
         };
         for (set, command, users) in [
-            ("env.num_envs=99", "play", "`train` and `bench` do"),
-            ("ppo.gamma=0.5", "view", "`train` and `bench` do"),
-            ("run.threads=3", "view", "`train` and `bench` do"),
-            ("training.tolerance.to=1", "play", "`train` and `bench` do"),
-            ("run.eval_every=3", "bench", "`train` does"),
-            ("ppo={gamma=0.5}", "play", "`train` and `bench` do"),
-            ("env={num_envs=9}", "view", "`train` and `bench` do"),
+            ("env.num_envs=99", "play", "`train` and `bench` can"),
+            ("ppo.gamma=0.5", "view", "`train` and `bench` can"),
+            ("run.threads=3", "view", "`train` and `bench` can"),
+            ("training.tolerance.to=1", "play", "`train` and `bench` can"),
+            ("run.eval_every=3", "bench", "`train` can"),
+            ("ppo={gamma=0.5}", "play", "`train` and `bench` can"),
+            ("env={num_envs=9}", "view", "`train` and `bench` can"),
         ] {
             let refusal = answer(set, command).unwrap_err();
             assert!(

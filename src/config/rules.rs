@@ -140,7 +140,7 @@ fn env(config: &Config, rules: &mut Rules) {
     let rule = format!("have coordinates of at most {FARTHEST} m");
     rules.check(near, "env.goal_position", rule);
     let model = &env.model;
-    let is_path = !model.is_empty() && !model.contains(char::is_control);
+    let is_path = (1..=4095).contains(&model.len()) && !model.contains(char::is_control);
     rules.check_part(is_path, "env.model", model, "be a path or \"builtin\"");
     let ratio = env.ctrl_dt / env.sim_dt;
     let whole = (1.0..=1e4).contains(&ratio.round()) && (ratio / ratio.round() - 1.0).abs() < 1e-6;
