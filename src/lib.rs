@@ -33,7 +33,7 @@
 //! | [`agent`] | environments, learner and rollout; one iteration of training | config, env, os, ppo, ranks, repose, schedule, spaces |
 //! | [`load`] | checkpoints and policies from untrusted files | config, evaluate, os, ppo, repose, run, sim |
 //! | [`mod@evaluate`] | whole episodes under one policy, the basis of scores | env, os, ppo, ranks, repose, rng, schedule, sim, spaces |
-//! | [`repose`] | the task: hand, observation (one table), reward, changes for training | config, env, os, quat, rng, sim, spaces |
+//! | [`repose`] | the task: hand, observation (one table), reward, changes for training | config, env, os, quat, rng, sim, spaces, statistics |
 //! | [`mod@env`] | many environments, in blocks that step without a barrier or all at once; no hand in it | ranks, rng, schedule, sim, spaces |
 //! | [`ppo`] | the learner: flat parameters, policy, two gradient backends (`fused`, ours; `candle`), one Adam, checkpoints | config, os, quat, ranks, rng, spaces |
 //! | [`config`] | all settings, their defaults and rules | os, sim |

@@ -46,9 +46,9 @@ impl Trace {
             "checkpoint": checkpoint,
             "seed": seed,
             "settings": config.unlike_default(),
-            "observation": hand.layout.groups.map(|Group { name, start, length, unit, .. }| {
+            "observation": Vec::from_iter(hand.layout.groups().map(|Group { name, start, length, unit, .. }| {
                 json!({ "name": name, "start": start, "length": length, "unit": unit })
-            }),
+            })),
             "joint_names": hand.parts.joints,
             "actuator_names": hand.parts.actuators,
             "fingertip_names": hand.parts.fingertips,

@@ -28,6 +28,8 @@ NOMINAL |= {"cube_com": [0, 0, 0], "gravity": [0, 0, 0], "cone": "scene", "actio
 # Settings in which the world of a trace may differ from the policy's: what moves, and what is late.
 OF_WORLD = ["friction_scale", "cube_mass_scale", "hand_mass_scale", "cube_size_scale", "gains_scale", "damping_scale", "frictionloss_scale",
             "cube_com", "gravity", "cone", "sim_dt", "action_delay", "prediction"]
+# The factors that a policy can be told, in the order of the observation.
+KNOWN = ["cube_mass", "cube_size", "damping", "friction"]
 # What the file and its settings must say.
 FACTS = set("action_offset action_scale config ema_alpha fingertip_names hinge_names joint_names object_name observation_names "
             "observation_sizes start_keyframe".split())
@@ -121,6 +123,9 @@ class Hand:
             sys.exit(f"error: the actuators of {scene} have other ranges than those that the policy was exported for")
         self.low, self.high = ranges.T
         self.previous_action = np.zeros(len(self.actuators))
+        # What `export --set env.known...` has stated of the hand and its object, for a policy that is told.
+        told = KNOWN if "known" in policy.names("observation_names") else []
+        self.known = np.log([env["known"].get(name, 1.0) for name in told])
         self.goal = np.array([1.0, 0, 0, 0])
 
     def place(self, qpos, qvel):
@@ -175,6 +180,7 @@ class Hand:
             positive(product(cube[3:], conjugate(self.goal))),
             *tips,
             self.previous_action,
+            self.known,
         ]).astype(np.float32)
 
     def predict(self, hand, observation):

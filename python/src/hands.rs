@@ -443,8 +443,7 @@ impl Hands {
             .task
             .hand
             .layout
-            .groups
-            .iter()
+            .groups()
             .map(|group| (group.name, group.start, group.length, group.unit))
             .collect()
     }

@@ -207,7 +207,7 @@ pub struct TrainArgs {
 #[derive(Args)]
 pub struct PlayArgs {
     /// Who acts: a checkpoint, a run folder (its best checkpoint, else its latest), a built-in policy (builtin, or robust for other
-    /// physics and delays), or actions without a policy (zero, random, wave) [default: the newest run, or builtin if there is none]
+    /// hands and cubes), or actions without a policy (zero, random, wave) [default: the newest run, or builtin if there is none]
     #[arg(long, value_name = "FILE|RUN|NAME", help_heading = POLICY)]
     pub ckpt: Option<PathBuf>,
     /// Number of episodes to play, each to its end [default: 256; 1 in a film or an HTML file; no limit in a window]
@@ -272,7 +272,7 @@ pub struct PlayArgs {
 #[derive(Args)]
 pub struct ExportArgs {
     /// Policy to export: a checkpoint, a run folder (its best checkpoint, else its latest), or a built-in policy:
-    /// builtin, or robust for other physics and delays [default: the newest run, or builtin if there is none]
+    /// builtin, or robust for other hands and cubes [default: the newest run, or builtin if there is none]
     #[arg(long, value_name = "FILE|RUN|NAME", help_heading = POLICY)]
     pub ckpt: Option<PathBuf>,
     /// Change one env.* setting that the file records, e.g. env.model=my_scene.xml; repeatable

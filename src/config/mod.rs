@@ -56,7 +56,7 @@ pub use layers::{MODEL, Override, Reader, Settings, Source, scene_option};
 pub use ramp::{Geometric, Ramp};
 pub use rules::FARTHEST;
 pub use settings::{
-    Activation, BUILTIN_MODEL, Backend, ByGroup, Config, EnvConfig, OfScene, PpoConfig, Precision,
+    Activation, BUILTIN_MODEL, Backend, ByName, Config, EnvConfig, OfScene, PpoConfig, Precision,
     RandomizationConfig, RunConfig, SuccessHold, Symmetry, TrainingConfig,
 };
 

@@ -219,7 +219,7 @@ fn type_of(expected: &Value) -> String {
             "a number, or { from = …, to = …, steps = …, after = … }"
         }
         Value::Table(table) if table.is_empty() => {
-            "a table of numbers by group of the observation, e.g. { joint_pos = 0.01 }"
+            "a table of numbers by name, e.g. { joint_pos = 0.01 }"
         }
         _ => "a section with keys",
     };

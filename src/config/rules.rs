@@ -15,7 +15,7 @@ type Range = (&'static str, fn(f64) -> bool, &'static str);
 /// The ranges of settings. Both ends of a ramp must lie in its range, and so must all values by group.
 const RANGES: [Range; 5] = [
     (
-        "env.sim_dt env.ctrl_dt env.rot_eps env.success_tolerance env.fall_dist training.tolerance ppo.learning_rate ppo.clip \
+        "env.known env.sim_dt env.ctrl_dt env.rot_eps env.success_tolerance env.fall_dist training.tolerance ppo.learning_rate ppo.clip \
          ppo.max_grad_norm ppo.reward_scale ppo.std",
         |x| x > 0.0,
         "be above 0",

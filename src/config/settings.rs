@@ -51,8 +51,9 @@ pub struct EnvConfig {
     pub cone: Cone,
     pub action_delay: u32,
     pub prediction: u32,
-    pub noise: ByGroup,
-    pub bias: ByGroup,
+    pub known: ByName,
+    pub noise: ByName,
+    pub bias: ByName,
     pub max_episode_seconds: f64,
     pub goal_position: OfScene<[f64; 3]>,
     pub target_height: f64,
@@ -102,8 +103,8 @@ impl<T: PartialEq> PartialEq for OfScene<T> {
     }
 }
 
-/// Values by the name of a group of the observation. Groups that are not named have 0.
-pub type ByGroup = BTreeMap<String, f64>;
+/// Values by the name of a group of the observation, or of a quantity.
+pub type ByName = BTreeMap<String, f64>;
 
 /// The effect of a step outside the tolerance on the counter of steps within it.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
@@ -144,8 +145,8 @@ pub struct RandomizationConfig {
     pub frictionloss: [f64; 2],
     pub gravity: f64,
     pub delay: [u32; 2],
-    pub noise: ByGroup,
-    pub bias: ByGroup,
+    pub noise: ByName,
+    pub bias: ByName,
     pub push: f64,
     pub push_steps: u32,
 }

@@ -62,7 +62,7 @@ fn metadata(loaded: &Loaded, task: &Task) -> Vec<(&'static str, String)> {
     let config = &task.config;
     let hand = &task.hand;
     let parts = &hand.parts;
-    let groups = &hand.layout.groups;
+    let groups = || hand.layout.groups();
     let ranges = || hand.actuators.iter().map(|actuator| actuator.range);
     let offsets = list(ranges().map(|[low, high]| (low + high) / 2.0));
     let mut facts = vec![
@@ -83,8 +83,11 @@ fn metadata(loaded: &Loaded, task: &Task) -> Vec<(&'static str, String)> {
         ("hinge_names", list(&parts.joints)),
         ("joint_names", list(&parts.actuators)),
         ("object_name", parts.object.clone()),
-        ("observation_names", list(groups.map(|group| group.name))),
-        ("observation_sizes", list(groups.map(|group| group.length))),
+        ("observation_names", list(groups().map(|group| group.name))),
+        (
+            "observation_sizes",
+            list(groups().map(|group| group.length)),
+        ),
         ("prediction", config.prediction.to_string()),
         (
             "program",

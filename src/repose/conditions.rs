@@ -4,12 +4,14 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
+use super::observation::KNOWN;
 use super::randomization::{EpisodePhysics, Randomization};
 use super::sensing;
 use super::task::Task;
 use crate::quat::{self, Quat};
 use crate::rng::{self, Rng};
 use crate::sim::Simulation;
+use crate::statistics::mean;
 
 /// The conditions of the current episode of one environment.
 #[derive(Default)]
@@ -60,6 +62,15 @@ impl Conditions {
     /// The control steps between an action and its effect.
     pub fn delay(&self, task: &Task) -> usize {
         (task.config.action_delay + self.draw.as_ref().map_or(0, EpisodePhysics::delay)) as usize
+    }
+
+    /// The logarithms of the factors of [`KNOWN`]: what the user states, times the mean of what the episode has drawn.
+    pub fn known(&self, task: &Task) -> [f64; 4] {
+        KNOWN.map(|name| {
+            let stated = task.config.known.get(name).unwrap_or(&1.0);
+            let drawn = self.draw.as_ref();
+            (stated * drawn.map_or(1.0, |draw| mean(&draw.physics[name]))).ln()
+        })
     }
 
     /// Applies the random force on the object that belongs to a step (from 0) of the episode of `rng`, and returns it, N.

@@ -71,11 +71,11 @@ impl Hand {
         scene.find_parts(parts)
     }
 
-    /// Binds these parts of `scene`, all of which are named but for the start.
+    /// Binds these parts of `scene`, all of which are named but for the start. Its policy is `told` what is known, or not.
     ///
     /// # Errors
     /// Fails with one message on all names that are missing, and on all that belong to another kind of object.
-    pub fn bind(scene: &Scene, parts: Parts) -> Result<Self> {
+    pub fn bind(scene: &Scene, parts: Parts, told: bool) -> Result<Self> {
         let mut problems = Vec::new();
         let joints = each(&parts.joints, |joint| scene.hinge(joint), &mut problems);
         let actuators = each(
@@ -112,7 +112,7 @@ impl Hand {
         Ok(Self {
             roots: roots(scene, &parts, &fingertips)?,
             start: scene.pose_of(keyframe),
-            layout: Layout::new(joints.len(), fingertips.len(), actuators.len()),
+            layout: Layout::new(joints.len(), fingertips.len(), actuators.len(), told),
             parts,
             joints,
             actuators,

@@ -30,6 +30,9 @@ pub enum Sensing {
     Known,
 }
 
+/// The quantities whose factors a policy can be told, in the order of the group `known`.
+pub const KNOWN: [&str; 4] = ["cube_mass", "cube_size", "damping", "friction"];
+
 /// The number of values of a fingertip.
 pub const TIP_SIZE: usize = 13;
 /// The index of its quaternion among them.
@@ -46,9 +49,9 @@ pub const TIPS: usize = 9;
 /// The layout of the observations of a hand.
 #[derive(Clone, Copy)]
 pub struct Layout {
-    /// All groups in order. Positions and velocities are in the world frame. Quaternions are w,x,y,z. Except for the
-    /// fingertips, they have w ≥ 0.
-    pub groups: [Group; 11],
+    groups: [Group; 12],
+    /// Whether the policy is told how the hand and its object differ from the scene.
+    pub told: bool,
     /// The number of values in an observation.
     pub size: usize,
     /// The number of values in an action.
@@ -63,8 +66,8 @@ impl Group {
 }
 
 impl Layout {
-    /// The layout for a hand with this many joints, fingertips and actuators.
-    pub fn new(joints: usize, fingertips: usize, actuators: usize) -> Self {
+    /// The layout for a hand with this many joints, fingertips and actuators, and for a policy that is `told` what is known.
+    pub fn new(joints: usize, fingertips: usize, actuators: usize, told: bool) -> Self {
         const NOTHING: &[usize] = &[];
         // Points and velocities change their y, axes their x and z, and so do quaternions.
         const POINT: &[usize] = &[1];
@@ -95,6 +98,13 @@ impl Layout {
                 TIP,
             ),
             ("previous_action", Known, actuators, "1", NOTHING),
+            (
+                "known",
+                Known,
+                if told { KNOWN.len() } else { 0 },
+                "ln of a factor",
+                NOTHING,
+            ),
         ];
         let mut size = 0;
         let groups = table.map(|(name, sensing, length, unit, mirrored)| {
@@ -110,9 +120,16 @@ impl Layout {
         });
         Self {
             groups,
+            told,
             size,
             actions: actuators,
         }
+    }
+
+    /// All groups in order. Positions and velocities are in the world frame. Quaternions are w,x,y,z. Except for the
+    /// fingertips, they have w ≥ 0. The group `known` is left out if the policy is not told what is known.
+    pub fn groups(&self) -> impl Iterator<Item = &Group> {
+        self.groups.iter().filter(|group| group.length > 0)
     }
 
     /// The groups that sensors measure.
@@ -218,10 +235,11 @@ mod tests {
 
     #[test]
     fn the_observation_is_laid_out_as_the_task_says() {
-        let layout = Layout::new(24, 5, 20);
-        let found = layout
-            .groups
-            .map(|part| (part.name, part.start, part.length));
+        let layout = Layout::new(24, 5, 20, false);
+        let found: Vec<_> = layout
+            .groups()
+            .map(|part| (part.name, part.start, part.length))
+            .collect();
         let expected = [
             ("joint_pos", 0, 24),
             ("joint_vel", 24, 24),
@@ -237,11 +255,14 @@ mod tests {
         ];
         assert_eq!(found, expected);
         assert_eq!((layout.size, layout.actions), (157, 20));
+        let told = Layout::new(24, 5, 20, true);
+        let last = told.groups().last().unwrap();
+        assert_eq!((last.name, last.start, told.size), ("known", 157, 161));
     }
 
     #[test]
     fn numbers_that_do_not_fit_into_their_part_are_refused() {
-        let layout = Layout::new(24, 5, 20);
+        let layout = Layout::new(24, 5, 20, false);
         let refused = |write: fn(&mut Writer)| {
             let mut observation = [0.0; 157];
             let mut cells = Writer::new(&layout, &mut observation);
@@ -257,7 +278,7 @@ mod tests {
             "out of order"
         );
         let all = |cells: &mut Writer| {
-            for part in Layout::new(24, 5, 20).groups {
+            for part in Layout::new(24, 5, 20, false).groups {
                 (0..part.length).for_each(|_| cells.put(part.name, [0.0]));
             }
         };

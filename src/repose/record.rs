@@ -36,6 +36,9 @@ pub struct Record {
     pub tips: Vec<[f64; 7]>,
     /// The rotations of a cube, by number, that a policy treats as the same.
     pub symmetry: Vec<usize>,
+    /// Whether the policy is told how the hand and its object differ from the scene.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub told: bool,
 }
 
 impl Record {
@@ -59,6 +62,7 @@ impl Record {
             fingertips,
             tips: tips.collect(),
             symmetry,
+            told: hand.layout.told,
         }
     }
 
@@ -109,12 +113,17 @@ impl Record {
 
     /// The observations and actions of a policy for it.
     pub fn spaces(&self) -> Spaces {
+        self.layout().spaces(&self.symmetry)
+    }
+
+    /// The layout of the observations of a policy for it.
+    pub(super) fn layout(&self) -> Layout {
         Layout::new(
             self.joints.len(),
             self.fingertips.len(),
             self.actuators.len(),
+            self.told,
         )
-        .spaces(&self.symmetry)
     }
 
     /// Checks by the names that a policy for this hand can act with the hand `there` of a scene, and says whether they tell that it is the

@@ -2,11 +2,11 @@
 
 use std::collections::BTreeMap;
 
-use anyhow::{Result, bail};
+use anyhow::{Result, ensure};
 use rand_distr::{Distribution, StandardNormal};
 
 use super::observation::{GOAL_QUAT, Layout, OBJECT_QUAT, RELATIVE_QUAT, TIP_QUAT};
-use crate::config::ByGroup;
+use crate::config::ByName;
 use crate::os::shortened;
 use crate::quat::{self, Quat};
 use crate::rng::Rng;
@@ -20,24 +20,11 @@ impl NoiseStd {
     ///
     /// # Errors
     /// Fails on the name of a group that does not exist or is not measured.
-    pub fn new(groups: &ByGroup, layout: &Layout) -> Result<Self> {
+    pub fn new(groups: &ByName, layout: &Layout) -> Result<Self> {
         let measured: Vec<&str> = layout.measured().map(|group| group.name).collect();
-        for name in groups.keys() {
-            if !measured.contains(&name.as_str()) {
-                let what = if layout.groups.iter().any(|group| group.name == name) {
-                    "is not measured"
-                } else {
-                    "is not a group of the observation"
-                };
-                bail!(
-                    "`{}` {what}; these groups can have noise: {}",
-                    shortened(name),
-                    measured.join(", ")
-                );
-            }
-        }
+        expect_names(groups, &measured)?;
         let mut all = Vec::new();
-        for group in layout.groups {
+        for group in layout.measured() {
             let std = groups.get(group.name).map_or(0.0, |&std| std as f32);
             if std != 0.0 {
                 all.extend(group.cells().map(|i| (i, std)));
@@ -52,6 +39,22 @@ impl NoiseStd {
             .iter()
             .map(|&(i, std)| (i, std * Distribution::<f32>::sample(&StandardNormal, rng)))
     }
+}
+
+/// Checks that values have no other names than these.
+///
+/// # Errors
+/// Fails with the first other name.
+pub fn expect_names(values: &ByName, names: &[&str]) -> Result<()> {
+    for name in values.keys() {
+        ensure!(
+            names.contains(&&**name),
+            "`{}` is none of {}",
+            shortened(name),
+            names.join(", ")
+        );
+    }
+    Ok(())
 }
 
 /// Adds the offset of an episode, which has these parts by the numbers of the values. On an orientation q it is a small rotation q ⊗ (1, v), where v are the last three of its four
@@ -113,7 +116,7 @@ mod tests {
     use crate::rng;
 
     fn shadow() -> Layout {
-        Layout::new(24, 5, 20)
+        Layout::new(24, 5, 20, false)
     }
 
     fn spread(groups: &[(&str, f64)]) -> Result<NoiseStd> {
@@ -144,17 +147,10 @@ mod tests {
 
     #[test]
     fn groups_that_do_not_exist_or_are_not_measured_are_refused() {
-        for (name, why) in [
-            ("joint_positions", "is not a group"),
-            ("goal_quat", "is not measured"),
-        ] {
+        for name in ["joint_positions", "goal_quat", "known"] {
             let error = spread(&[(name, 0.1)]).unwrap_err().to_string();
-            assert!(
-                error.contains(name)
-                    && error.contains(why)
-                    && error.contains("joint_pos, joint_vel"),
-                "{error}"
-            );
+            let expected = format!("`{name}` is none of joint_pos, joint_vel, ");
+            assert!(error.contains(&expected), "{error}");
         }
     }
 

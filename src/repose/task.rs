@@ -6,9 +6,10 @@ use std::sync::Arc;
 use anyhow::{Context, Result, ensure};
 
 use super::mirror::Mirror;
+use super::observation::KNOWN;
 use super::physics::Physics;
 use super::prediction::Predictor;
-use super::sensing::NoiseStd;
+use super::sensing::{NoiseStd, expect_names};
 use super::{Hand, Record};
 use crate::config::{Config, EnvConfig, FARTHEST};
 use crate::os;
@@ -76,7 +77,8 @@ impl Task {
             parts.goal = GOAL.into();
         }
         let nominal = Scene::load(file, &compilation)?;
-        let mut hand = Hand::bind(&nominal, parts).with_context(|| origin(file))?;
+        let mut hand =
+            Hand::bind(&nominal, parts, !config.known.is_empty()).with_context(|| origin(file))?;
         let scene = nominal.varied(&Physics::of_task(&config).changes(&hand));
         hand.object.inertia *= config.cube_mass_scale;
         config.goal_position.settle(hand.place());
@@ -88,6 +90,7 @@ impl Task {
             hand.parts.object
         );
         settle_sizes(&mut config, &hand, file)?;
+        expect_names(&config.known, &KNOWN).context("env.known")?;
         let noise = NoiseStd::new(&config.noise, &hand.layout).context("env.noise")?;
         let bias = NoiseStd::new(&config.bias, &hand.layout).context("env.bias")?;
         Ok(Arc::new(Self {
@@ -116,7 +119,7 @@ impl Task {
             look,
             self.goal_place(),
         )?;
-        let hand = Hand::bind(&nominal, self.hand.parts.clone())?;
+        let hand = Hand::bind(&nominal, self.hand.parts.clone(), self.hand.layout.told)?;
         let mut scene = nominal.varied(&Physics::of_task(&self.config).changes(&hand));
         scene.set_look(look, &nominal);
         Ok(Arc::new(Self {
@@ -303,13 +306,18 @@ impl Task {
                 here.symmetry.len()
             ));
         }
-        let symmetry = policy.symmetry.clone();
-        Ok(Arc::new(Self {
+        ensure!(
+            policy.told || !here.told,
+            "env.known: this policy is not told what is known"
+        );
+        let mut task = Self {
             mirror,
-            symmetry,
+            symmetry: policy.symmetry.clone(),
             warnings,
             ..Arc::unwrap_or_clone(self)
-        }))
+        };
+        task.hand.layout = policy.layout();
+        Ok(Arc::new(task))
     }
 
     /// The record of its hand and object.

@@ -39,14 +39,15 @@ fn documents() -> Vec<PathBuf> {
 #[test]
 fn the_table_of_the_observation_is_the_one_of_the_program() {
     let text = read("docs/OBSERVATION.md");
-    let groups = task(&[]).hand.layout.groups;
+    let task = task(&["env.known.friction=1"]);
+    let groups: Vec<&Group> = task.hand.layout.groups().collect();
     for Group {
         name,
         start,
         length,
         unit,
         ..
-    } in groups
+    } in &groups
     {
         let row = format!(
             "| {start} … {} | `{name}` | {length} | {unit} |",

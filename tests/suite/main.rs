@@ -38,6 +38,7 @@ mod support;
 mod survival;
 mod sweep;
 mod task;
+mod told;
 mod training;
 #[cfg(feature = "viewer")]
 mod window;

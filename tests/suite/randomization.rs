@@ -715,13 +715,13 @@ fn what_cannot_be_varied_is_named() {
         (
             &["randomization.noise={joints=1}"],
             &[
-                "randomization.noise: `joints` is not a group",
+                "randomization.noise: `joints` is none of",
                 "joint_pos, joint_vel",
             ],
         ),
         (
             &["env.bias.goal_quat=1"],
-            &["env.bias: `goal_quat` is not measured", "cube_quat"],
+            &["env.bias: `goal_quat` is none of", "cube_quat"],
         ),
         (
             &["env.noise.joint_pos=-1"],
@@ -733,7 +733,7 @@ fn what_cannot_be_varied_is_named() {
         ),
         (
             &["env.noise=0.1"],
-            &["env.noise = 0.1: must be a table of numbers by group"],
+            &["env.noise = 0.1: must be a table of numbers by name"],
         ),
         (
             &["env.cone=round"],

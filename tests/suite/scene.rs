@@ -54,7 +54,12 @@ fn assert_range(found: [f64; 2], expected: [f64; 2]) {
 #[test]
 fn the_scene_has_the_joints_actuators_and_limits_of_the_hand() {
     let scene = Scene::load(None, &Compilation::plain(0.01, Cone::Scene)).unwrap();
-    let hand = Hand::bind(&scene, Hand::find(&scene, &Parts::default()).unwrap()).unwrap();
+    let hand = Hand::bind(
+        &scene,
+        Hand::find(&scene, &Parts::default()).unwrap(),
+        false,
+    )
+    .unwrap();
     assert_eq!(scene.controls(), 20);
     for (name, range) in [
         ("rh_WRJ2", [-0.523599, 0.174533]),

@@ -119,6 +119,7 @@ const CHANGES: &[(&str, &[&str])] = &[
     ("ppo.away_std=0.9", &[]),
     ("ppo.away_range=[0.1,3.2]", &["ppo.away_std=0.9"]),
     ("ppo.away_range=[0.1,3.2]", &["ppo.away_std=0"]),
+    ("env.known.friction=2", &[]),
     ("run.total_steps=384", &[]),
     ("run.checkpoint_every=1", &[]),
     ("run.eval_every=2", &[]),

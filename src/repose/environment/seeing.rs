@@ -117,6 +117,9 @@ impl Repose {
             "previous_action",
             self.last.action.iter().copied().map(f64::from),
         );
+        if hand.layout.told {
+            cells.put("known", self.conditions.known(&self.task));
+        }
         cells.finish();
     }
 }
