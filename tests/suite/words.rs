@@ -1,5 +1,7 @@
 //! What the program says about itself: help, version, completions, and what comes next.
 
+use clap::ValueEnum;
+
 use crate::support::{command, program, stderr, succeeded, train};
 
 const COMMANDS: [&str; 9] = [
@@ -108,6 +110,13 @@ fn completions_and_a_manual_page_know_every_command() {
             COMMANDS.iter().all(|name| is_word(name)) && text.contains("stop-after"),
             "{shell}"
         );
+    }
+    // The program writes these two lines itself, also where there is no fish to try them.
+    let fish = stdout(&["completions", "fish"]);
+    let shells = clap_complete::Shell::value_variants();
+    let shells = Vec::from_iter(shells.iter().map(ToString::to_string)).join(" ");
+    for words in [shells, format!("{} help", COMMANDS.join(" "))] {
+        assert!(fish.contains(&format!("-a \"{words}\"\n")), "{words}");
     }
     let page = stdout(&["man"]);
     for name in COMMANDS {
