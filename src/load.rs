@@ -13,7 +13,7 @@ use crate::config::{Config, Override, PpoConfig, Reader, Settings, Source};
 use crate::evaluate::Actor;
 use crate::os::{self, say};
 use crate::ppo::{Checkpoint, Damaged, Policy, Progress};
-use crate::repose::{Record, Task, is_physical};
+use crate::repose::{Record, Task, is_physical, physical};
 use crate::run;
 use crate::sim::SceneFiles;
 
@@ -216,9 +216,15 @@ impl Loaded {
         if config.env.prediction == 0 {
             return Ok(task);
         }
-        // Who predicts knows the physics that the policy was trained with, whatever the world is.
+        // Who predicts knows the physics that the policy was trained with, and what is known of the world, whatever the world is.
         let mut sets = overrides.to_vec();
         sets.retain(|set| !set.key.strip_prefix("env.").is_some_and(is_physical));
+        let own = physical(&self.settings(&sets)?.env);
+        for (name, known) in config.env.known {
+            let key = format!("{name}_scale");
+            let own = own[&key].as_float().expect("a factor");
+            sets.push(Override::new(format!("env.{key}"), known * own));
+        }
         let model = Task::with_files(&self.settings(&sets)?, task.files())?;
         Ok(task.predicted_by(&model))
     }

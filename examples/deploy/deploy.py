@@ -128,6 +128,13 @@ class Hand:
         self.known = np.log([env["known"].get(name, 1.0) for name in told])
         self.goal = np.array([1.0, 0, 0, 0])
 
+    def model_of(self, policy, scene):
+        """Returns a hand that predicts: this one, changed by what `export --set env.known...` has stated of it."""
+        known = {f"{name}_scale": factor for name, factor in self.env.get("known", {}).items()}
+        if twice := [scale for scale in known if self.env[scale] != 1]:
+            sys.exit(f"error: the policy was exported with env.{twice[0]} and with the factor that it is told; export without env.{twice[0]}")
+        return Hand(policy, scene, known)
+
     def place(self, qpos, qvel):
         """Sets the positions of everything. Positions of bodies follow."""
         mujoco.mj_resetData(self.model, self.data)
@@ -425,12 +432,12 @@ def main():
     with read_from(args.policy):
         policy = Policy(args.policy)
         hand = Hand(policy, args.scene)
+        model = hand.model_of(policy, args.scene) if hand.env["prediction"] else None
     if args.check:
         with read_from(args.check):
-            alike = check(policy, args.scene, hand, args.check)
+            alike = check(policy, args.scene, model or hand, args.check)
         sys.exit(0 if alike else "error: too far off")
     with read_from(args.policy):
-        model = Hand(policy, args.scene) if hand.env["prediction"] else None
         found = score(play(policy, hand, model, args.episodes, args.seed))
     if args.json:
         print(json.dumps(found))

@@ -46,24 +46,16 @@ impl Diverged {
     }
 }
 
-/// A warning if more than 1 % of the steps diverged: what is learnt or scored then is not the task.
-pub fn divergence(diverged: u64, steps: u64) -> Option<String> {
-    (diverged * 100 > steps).then(|| {
-        format!(
-            "in {diverged} of {steps} steps the physics diverged and the episode ended: this combination of scene, \
-             env.sim_dt, masses, friction, gains and damping cannot be simulated"
-        )
-    })
-}
-
-/// A warning if more than 1 % of the predictions diverged.
-pub fn unpredicted(count: u64, steps: u64) -> Option<String> {
-    (count * 100 > steps).then(|| {
-        format!(
-            "in {count} of {steps} steps the prediction diverged, and the policy saw what was measured: a model cannot go on \
-             from such a measurement (env.prediction, env.noise, env.bias)"
-        )
-    })
+/// A warning if the physics diverged in more than 1 % of the steps, and what is learnt or scored then is not the task. Otherwise a warning
+/// if more than 1 % of the predictions diverged.
+pub fn divergence(diverged: u64, unpredicted: u64, steps: u64) -> Option<String> {
+    let warning =
+        |count, what| (count * 100 > steps).then(|| format!("in {count} of {steps} steps {what}"));
+    let physics = "the physics diverged and the episode ended: this combination of scene, env.sim_dt, masses, friction, gains and \
+                   damping cannot be simulated";
+    let prediction = "the prediction diverged, and the policy saw what was measured: a model cannot go on from such a measurement \
+                      (env.prediction, env.noise, env.bias)";
+    warning(diverged, physics).or_else(|| warning(unpredicted, prediction))
 }
 
 /// The number of steps between two kept states.

@@ -18,7 +18,7 @@ mod sensing;
 mod servos;
 mod task;
 
-pub use divergence::{Diverged, Tail, divergence, unpredicted};
+pub use divergence::{Diverged, Tail, divergence};
 pub use environment::Repose;
 pub use episode::{EpisodeStats, StepSums};
 pub use hand::{ACTUATORS, FINGERTIPS, Hand, JOINTS};

@@ -7,7 +7,7 @@ use std::ops::Index;
 
 use serde_json::{Map, Value, json};
 
-use super::divergence::{divergence, unpredicted};
+use super::divergence::divergence;
 use super::{EpisodeStats, TaskReward, add, named, task_terms};
 use crate::os::number;
 
@@ -246,8 +246,7 @@ impl Score {
 
     /// A warning if many of the steps diverged. Each such step ended an episode.
     pub fn divergence(&self) -> Option<String> {
-        divergence(self.diverged as u64, self.env_steps)
-            .or_else(|| unpredicted(self.unpredicted, self.env_steps))
+        divergence(self.diverged as u64, self.unpredicted, self.env_steps)
     }
 
     /// The values of all measures, in order.

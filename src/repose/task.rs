@@ -174,23 +174,11 @@ impl Task {
                 "env.sim_dt = {sim_dt} s replaces the timestep of {scene}, {timestep} s"
             ));
         }
-        let mut unused: Vec<String> = self
-            .scene
-            .keyframes()
-            .iter()
-            .map(|key| format!("`{key}`"))
-            .collect();
-        let used = Vec::from_iter(self.hand.keyframe.map(|keyframe| unused.remove(keyframe)));
-        for (keys, what) in [
-            (used, "episodes start in the keyframe"),
-            (unused, "no episode uses the keyframes"),
-        ] {
-            if !keys.is_empty() {
-                notes.push(format!(
-                    "{what} {} of {scene}",
-                    os::shortened(&keys.join(", "))
-                ));
-            }
+        if let Some(keyframe) = self.hand.keyframe {
+            notes.push(format!(
+                "episodes start in the keyframe `{}` of {scene}",
+                self.scene.keyframes()[keyframe]
+            ));
         }
         if self.unnamed > 0 {
             notes.push(format!(

@@ -12,7 +12,7 @@ use crate::agent::Agent;
 use crate::config::{Config, EnvConfig, scene_option};
 use crate::os::{self, Requests, Status, StatusLine, say};
 use crate::ppo::{Checkpoint, Rise};
-use crate::repose::{HEADLINE, Repose, Score, divergence, measure, unpredicted};
+use crate::repose::{HEADLINE, Repose, Score, divergence, measure};
 use crate::run::Report;
 
 /// The factor by which, and the iterations for which, the KL divergence must lie beyond its target for a warning.
@@ -76,8 +76,7 @@ impl Lead {
             ..
         } = outcome;
         self.diverged += steps.diverged;
-        let warning = divergence(steps.diverged, steps.steps)
-            .or_else(|| unpredicted(steps.unpredicted, steps.steps))
+        let warning = divergence(steps.diverged, steps.unpredicted, steps.steps)
             .or_else(|| evaluation.divergence());
         if let Some(warning) = warning.filter(|_| !self.warned) {
             self.warned = true;

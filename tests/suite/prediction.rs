@@ -1,5 +1,6 @@
 //! Late actions: the policy sees where a model of the hand will be when its action takes effect.
 
+use shadow_repose::config::Override;
 use shadow_repose::env::{Env, EnvState, Resumable};
 use shadow_repose::load::Loaded;
 use shadow_repose::repose::{Repose, Task};
@@ -19,12 +20,26 @@ fn seen(env: &mut Repose, first: Vec<f32>, steps: usize) -> Vec<[Vec<f32>; 2]> {
     let mut observation = first;
     let mut all = Vec::new();
     for step in 0..=steps {
-        let mut measured = vec![0.0; OBSERVATION_SIZE];
+        let mut measured = vec![0.0; observation.len()];
         env.observe(&mut measured);
         all.push([observation.clone(), measured]);
         let _ = env.step(&action(step), &mut observation);
     }
     all
+}
+
+/// The mean difference between what is seen and what is measured after `delay` more steps, up to the last action, which is known.
+/// Contacts make single values differ more.
+fn error(all: &[[Vec<f32>; 2]], which: usize, delay: usize) -> f32 {
+    let pairs = all.iter().zip(&all[delay..]);
+    let all: Vec<f32> = pairs
+        .flat_map(|(now, later)| differences(&now[which][..137], &later[1][..137]))
+        .collect();
+    all.iter().sum::<f32>() / all.len() as f32
+}
+
+fn sets(sets: &[&str]) -> Vec<Override> {
+    sets.iter().map(|set| set.parse().unwrap()).collect()
 }
 
 fn differences(a: &[f32], b: &[f32]) -> Vec<f32> {
@@ -40,15 +55,7 @@ fn what_is_predicted_is_what_is_measured_when_the_action_takes_effect() {
         ]);
         let (mut env, first) = started(&task);
         let all = seen(&mut env, first, 40);
-        // Up to the last action, which is known. Contacts make single values differ more, so the mean counts.
-        let errors = |which: usize| {
-            let pairs = all.iter().zip(&all[delay..]);
-            let all: Vec<f32> = pairs
-                .flat_map(|(now, later)| differences(&now[which][..137], &later[1][..137]))
-                .collect();
-            all.iter().sum::<f32>() / all.len() as f32
-        };
-        let [predicted, measured] = [0, 1].map(errors);
+        let [predicted, measured] = [0, 1].map(|which| error(&all, which, delay));
         assert!(
             predicted < 0.1 * measured,
             "delay {delay}: {predicted} of {measured}"
@@ -110,11 +117,6 @@ fn a_saved_environment_goes_on_predicting_with_the_same_bits() {
 #[test]
 fn what_the_user_changes_in_play_changes_the_world_and_not_the_model() {
     let loaded = Loaded::find(Some("builtin".as_ref()), &[]).unwrap();
-    let sets = |sets: &[&str]| {
-        sets.iter()
-            .map(|set| set.parse().unwrap())
-            .collect::<Vec<_>>()
-    };
     let after = |task: std::sync::Arc<Task>| {
         let (mut env, first) = started(&task);
         seen(&mut env, first, 0).pop().unwrap()
@@ -127,6 +129,46 @@ fn what_the_user_changes_in_play_changes_the_world_and_not_the_model() {
     assert_eq!((&usual[1], &usual[0]), (&played[1], &played[0]));
     assert_eq!(trained[1], usual[1]);
     assert_ne!(trained[0], usual[0]);
+}
+
+#[test]
+fn the_model_of_a_policy_that_is_told_what_is_known_of_the_world_has_it_too() {
+    let robust = Loaded::find(Some("robust".as_ref()), &[]).unwrap();
+    let world = [
+        "env.prediction=2",
+        "env.action_delay=2",
+        "env.cube_size_scale=0.8",
+        "env.damping_scale=3",
+    ];
+    let known = ["env.known={cube_size=0.8,damping=3}"];
+    let [wrong, told] = [&[][..], &known].map(|known| {
+        let task = robust.task(&sets(&[&world[..], known].concat())).unwrap();
+        let (mut env, first) = started(&task);
+        error(&seen(&mut env, first, 40), 0, 2)
+    });
+    assert!(told < 0.2 * wrong, "{told}, not told {wrong}");
+
+    let folder = tempfile::tempdir().unwrap();
+    let damped = [
+        "--set",
+        "env.damping_scale=2",
+        "--set",
+        "env.known.damping=1",
+    ];
+    let run = ["--run-dir", "run", "--total-steps", "256"];
+    succeeded(program(
+        folder.path(),
+        &[&train(&run)[..], &damped].concat(),
+    ));
+    let own = Loaded::find(Some(&folder.path().join("run")), &[]).unwrap();
+    let stated = [
+        "env.prediction=1",
+        "env.damping_scale=7",
+        "env.known.damping=1.5",
+    ];
+    let task = own.task(&sets(&stated)).unwrap();
+    assert_eq!(task.config.damping_scale, 7.0);
+    assert_eq!(task.predicted_with().unwrap().damping_scale, 3.0);
 }
 
 #[test]

@@ -52,7 +52,7 @@ pub(crate) fn env_config(settings: &[&str]) -> EnvConfig {
 /// Returns an environment of `task` at the start of episode 0, and its observation.
 pub(crate) fn started(task: &Arc<Task>) -> (Repose, Vec<f32>) {
     let mut env = Repose::new(task);
-    let mut observation = vec![0.0; OBSERVATION_SIZE];
+    let mut observation = vec![0.0; task.record().spaces().observation_size];
     env.reset(rng::stream(7, "test", 0), &mut observation);
     (env, observation)
 }
