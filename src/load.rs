@@ -217,13 +217,16 @@ impl Loaded {
             return Ok(task);
         }
         // Who predicts knows the physics that the policy was trained with, and what is known of the world, whatever the world is.
+        let of_world = |name: &str| is_physical(name) || name.starts_with("known");
         let mut sets = overrides.to_vec();
-        sets.retain(|set| !set.key.strip_prefix("env.").is_some_and(is_physical));
-        let own = physical(&self.settings(&sets)?.env);
+        sets.retain(|set| !set.key.strip_prefix("env.").is_some_and(of_world));
+        let own = self.settings(&sets)?.env;
+        let scales = physical(&own);
         for (name, known) in config.env.known {
             let key = format!("{name}_scale");
-            let own = own[&key].as_float().expect("a factor");
-            sets.push(Override::new(format!("env.{key}"), known * own));
+            let scale = scales[&key].as_float().expect("a factor");
+            let factor = known / own.known.get(&name).unwrap_or(&1.0);
+            sets.push(Override::new(format!("env.{key}"), scale * factor));
         }
         let model = Task::with_files(&self.settings(&sets)?, task.files())?;
         Ok(task.predicted_by(&model))

@@ -130,10 +130,14 @@ class Hand:
 
     def model_of(self, policy, scene):
         """Returns a hand that predicts: this one, changed by what `export --set env.known...` has stated of it."""
-        known = {f"{name}_scale": factor for name, factor in self.env.get("known", {}).items()}
-        if twice := [scale for scale in known if self.env[scale] != 1]:
-            sys.exit(f"error: the policy was exported with env.{twice[0]} and with the factor that it is told; export without env.{twice[0]}")
-        return Hand(policy, scene, known)
+        told = {}
+        for name, factor in self.env.get("known", {}).items():
+            scale = self.env[f"{name}_scale"]
+            if scale == 1:
+                told[f"{name}_scale"] = factor
+            elif factor not in (1, scale):
+                sys.exit(f"error: the policy was exported with env.{name}_scale = {scale} and env.known.{name} = {factor}: give both one value")
+        return Hand(policy, scene, told)
 
     def place(self, qpos, qvel):
         """Sets the positions of everything. Positions of bodies follow."""

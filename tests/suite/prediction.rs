@@ -153,7 +153,7 @@ fn the_model_of_a_policy_that_is_told_what_is_known_of_the_world_has_it_too() {
         "--set",
         "env.damping_scale=2",
         "--set",
-        "env.known.damping=1",
+        "env.known.damping=2",
     ];
     let run = ["--run-dir", "run", "--total-steps", "256"];
     succeeded(program(
@@ -161,14 +161,12 @@ fn the_model_of_a_policy_that_is_told_what_is_known_of_the_world_has_it_too() {
         &[&train(&run)[..], &damped].concat(),
     ));
     let own = Loaded::find(Some(&folder.path().join("run")), &[]).unwrap();
-    let stated = [
-        "env.prediction=1",
-        "env.damping_scale=7",
-        "env.known.damping=1.5",
-    ];
-    let task = own.task(&sets(&stated)).unwrap();
-    assert_eq!(task.config.damping_scale, 7.0);
-    assert_eq!(task.predicted_with().unwrap().damping_scale, 3.0);
+    let late = ["env.prediction=1", "env.damping_scale=7"];
+    for (stated, expected) in [(&[][..], 2.0), (&["env.known.damping=3"], 3.0)] {
+        let task = own.task(&sets(&[&late[..], stated].concat())).unwrap();
+        assert_eq!(task.config.damping_scale, 7.0);
+        assert_eq!(task.predicted_with().unwrap().damping_scale, expected);
+    }
 }
 
 #[test]
