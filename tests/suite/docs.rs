@@ -194,7 +194,7 @@ fn every_setting_and_option_that_the_documents_name_exists() {
                 assert!(is_known || stands_for_some, "{}: {word}", path.display());
             }
             if word.starts_with("--") && word.len() > 3 && text.contains("shadow-repose") {
-                const OF_OTHERS: [&str; 26] = [
+                const OF_OTHERS: [&str; 27] = [
                     "--lib",
                     "--version",
                     "--rm",
@@ -221,6 +221,7 @@ fn every_setting_and_option_that_the_documents_name_exists() {
                     "--mem",
                     "--time",
                     "--requeue",
+                    "--undo",
                 ];
                 let of_others = OF_OTHERS.contains(&word)
                     || word.starts_with("--cpus")

@@ -11,6 +11,9 @@ use shadow_repose::rng;
 
 use crate::support::{OBSERVATION_SIZE, config, program, stderr, succeeded, task, train};
 
+const BUILTIN: &str = "assets/policies/repose.safetensors";
+const ROBUST: &str = "assets/policies/robust.safetensors";
+
 /// The last values of an observation of this environment at the start of an episode, which begin with the group `known`.
 fn told(env: &mut Repose, episode: u64) -> Vec<f32> {
     let mut observation = vec![0.0; OBSERVATION_SIZE + 4];
@@ -18,22 +21,26 @@ fn told(env: &mut Repose, episode: u64) -> Vec<f32> {
     observation.split_off(OBSERVATION_SIZE)
 }
 
+/// The path of a file of the checkout.
+fn file(name: &str) -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join(name)
+}
+
 /// Runs `scripts/tell`.
-fn tell(policy: &Path, told: &Path) -> Output {
-    let scripts = Path::new(env!("CARGO_MANIFEST_DIR")).join("scripts/tell");
+fn tell(args: &[&Path]) -> Output {
     let mut python = Command::new("python3");
-    python.arg(scripts).args([policy, told]).output().unwrap()
+    python
+        .arg(file("scripts/tell"))
+        .args(args)
+        .output()
+        .unwrap()
 }
 
 /// A folder with the built-in policy, told and untold.
 fn folder() -> (tempfile::TempDir, PathBuf) {
     let folder = tempfile::tempdir().unwrap();
-    let builtin = concat!(
-        env!("CARGO_MANIFEST_DIR"),
-        "/assets/policies/repose.safetensors"
-    );
     let path = folder.path().join("told");
-    succeeded(tell(Path::new(builtin), &path));
+    succeeded(tell(&[&file(BUILTIN), &path]));
     (folder, path)
 }
 
@@ -91,7 +98,10 @@ fn a_policy_that_scripts_tell_has_widened_acts_as_before_until_it_is_trained_wha
     let before = play("builtin", &[]);
     assert_eq!(play("told", &[]), before);
     assert_eq!(play("told", &["--set", "env.known.cube_size=1.2"]), before);
-    let again = tell(&path, &folder.path().join("twice"));
+    let untold = folder.path().join("untold");
+    succeeded(tell(&["--undo".as_ref(), &path, &untold]));
+    assert_eq!(fs::read(untold).unwrap(), fs::read(file(BUILTIN)).unwrap());
+    let again = tell(&[&path, &folder.path().join("twice")]);
     assert!(!again.status.success() && stderr(&again).contains("that is told nothing yet"));
 
     let init = ["--init", "told", "--run-dir", "run", "--total-steps", "256"];
@@ -107,6 +117,36 @@ fn a_policy_that_scripts_tell_has_widened_acts_as_before_until_it_is_trained_wha
     assert!(score != other, "it has learnt to see what it is told");
     let resume = ["train", "--resume", "run", "--total-steps", "384"];
     succeeded(program(folder.path(), &resume));
+}
+
+#[test]
+fn the_built_in_policy_is_robust_without_its_four_inputs_and_acts_as_robust_that_is_told_nothing() {
+    let folder = tempfile::tempdir().unwrap();
+    let folder = folder.path();
+    succeeded(tell(&[
+        "--undo".as_ref(),
+        &file(ROBUST),
+        &folder.join("untold"),
+    ]));
+    let actions = |policy: &str| -> Vec<f64> {
+        let short = "env.max_episode_seconds=0.1";
+        let play = ["play", "--ckpt", policy, "--out", "t.jsonl", "--set", short];
+        succeeded(program(folder, &play));
+        let trace = fs::read_to_string(folder.join("t.jsonl")).unwrap();
+        let lines = trace
+            .lines()
+            .map(|line| serde_json::from_str::<Value>(line).unwrap());
+        let actions = lines.filter_map(|line| line.get("action").cloned());
+        actions
+            .flat_map(|action| serde_json::from_value::<Vec<f64>>(action).unwrap())
+            .collect()
+    };
+    let untold = actions("untold");
+    assert!(actions("builtin") == untold);
+    let robust = actions("robust");
+    assert!(robust.len() == untold.len() && robust.len() > 100);
+    let far = |(a, b): (&f64, &f64)| (a - b).abs() > 1e-4;
+    assert!(!robust.iter().zip(&untold).any(far));
 }
 
 #[test]
@@ -169,5 +209,11 @@ fn a_new_policy_is_told_if_any_factor_is_given_and_its_files_say_where_the_value
     let stated = ["--ckpt", "run", "--out", "t.jsonl"];
     let stated = [&play[..1], &stated, &play[3..], &export[3..]].concat();
     succeeded(program(folder, &stated));
-    crate::export::check_in_python(folder, &["policy.onnx", "--check", "t.jsonl"]);
+    let check = ["policy.onnx", "--check", "t.jsonl"];
+    crate::export::check_in_python(folder, &check);
+    let late = ["--set", "env.prediction=2"];
+    succeeded(program(folder, &[&export[..], &late].concat()));
+    let world = ["--set", "env.friction_scale=0.5"];
+    succeeded(program(folder, &[&stated[..], &late, &world].concat()));
+    crate::export::check_in_python(folder, &check);
 }
