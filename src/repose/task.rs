@@ -177,7 +177,7 @@ impl Task {
         if let Some(keyframe) = self.hand.keyframe {
             notes.push(format!(
                 "episodes start in the keyframe `{}` of {scene}",
-                self.scene.keyframes()[keyframe]
+                os::shortened(&self.scene.keyframes()[keyframe])
             ));
         }
         if self.unnamed > 0 {

@@ -44,6 +44,26 @@ fn folder() -> (tempfile::TempDir, PathBuf) {
     (folder, path)
 }
 
+/// The actions of a policy in the first 0.1 s of episodes.
+fn actions(folder: &Path, policy: &str) -> Vec<f64> {
+    let short = "env.max_episode_seconds=0.1";
+    let play = ["play", "--ckpt", policy, "--out", "t.jsonl", "--set", short];
+    succeeded(program(folder, &play));
+    let trace = fs::read_to_string(folder.join("t.jsonl")).unwrap();
+    trace
+        .lines()
+        .map(|line| serde_json::from_str::<Value>(line).unwrap())
+        .filter_map(|line| line.get("action").cloned())
+        .flat_map(|action| serde_json::from_value::<Vec<f64>>(action).unwrap())
+        .collect()
+}
+
+fn expect_alike(some: &[f64], others: &[f64]) {
+    assert!(some.len() == others.len() && some.len() > 100);
+    let far = |(a, b): (&f64, &f64)| (a - b).abs() > 1e-4;
+    assert!(!some.iter().zip(others).any(far));
+}
+
 fn json(output: Output) -> Value {
     serde_json::from_slice(&succeeded(output).stdout).unwrap()
 }
@@ -128,25 +148,21 @@ fn the_built_in_policy_is_robust_without_its_four_inputs_and_acts_as_robust_that
         &file(ROBUST),
         &folder.join("untold"),
     ]));
-    let actions = |policy: &str| -> Vec<f64> {
-        let short = "env.max_episode_seconds=0.1";
-        let play = ["play", "--ckpt", policy, "--out", "t.jsonl", "--set", short];
-        succeeded(program(folder, &play));
-        let trace = fs::read_to_string(folder.join("t.jsonl")).unwrap();
-        let lines = trace
-            .lines()
-            .map(|line| serde_json::from_str::<Value>(line).unwrap());
-        let actions = lines.filter_map(|line| line.get("action").cloned());
-        actions
-            .flat_map(|action| serde_json::from_value::<Vec<f64>>(action).unwrap())
-            .collect()
-    };
-    let untold = actions("untold");
-    assert!(actions("builtin") == untold);
-    let robust = actions("robust");
-    assert!(robust.len() == untold.len() && robust.len() > 100);
-    let far = |(a, b): (&f64, &f64)| (a - b).abs() > 1e-4;
-    assert!(!robust.iter().zip(&untold).any(far));
+    let untold = actions(folder, "untold");
+    assert!(actions(folder, "builtin") == untold);
+    expect_alike(&actions(folder, "robust"), &untold);
+}
+
+#[test]
+fn a_policy_whose_inputs_scripts_tell_has_taken_acts_as_it_did_with_what_its_settings_state() {
+    let folder = tempfile::tempdir().unwrap();
+    let folder = folder.path();
+    let new = ["--run-dir", "run", "--total-steps", "256"];
+    let known = ["--set", "env.known={friction=0.5,damping=2}"];
+    succeeded(program(folder, &train(&[&new[..], &known].concat())));
+    let run = folder.join("run/policy.safetensors");
+    succeeded(tell(&["--undo".as_ref(), &run, &folder.join("untold")]));
+    expect_alike(&actions(folder, "run"), &actions(folder, "untold"));
 }
 
 #[test]
