@@ -8,7 +8,7 @@ use std::process::Command;
 use crate::support::{SCENE, program, stderr, succeeded, train};
 
 /// Returns the Python that .ci/run has prepared with mujoco, onnx and onnxruntime.
-fn python() -> Option<OsString> {
+pub(crate) fn python() -> Option<OsString> {
     let python = std::env::var_os("SHADOW_REPOSE_PYTHON");
     if python.is_none() {
         eprintln!(

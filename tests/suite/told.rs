@@ -232,4 +232,16 @@ fn a_new_policy_is_told_if_any_factor_is_given_and_its_files_say_where_the_value
     let world = ["--set", "env.friction_scale=0.5"];
     succeeded(program(folder, &[&stated[..], &late, &world].concat()));
     crate::export::check_in_python(folder, &check);
+    let other = ["--set", "env.friction_scale=0.7"];
+    succeeded(program(folder, &[&export[..], &late, &other].concat()));
+    if let Some(python) = crate::export::python() {
+        let mut python = Command::new(python);
+        python.args([&file("examples/deploy/deploy.py"), &folder.join(check[0])]);
+        let refused = python.output().unwrap();
+        assert!(
+            stderr(&refused).contains("env.friction_scale = 0.7 and env.known.friction = 0.5"),
+            "{}",
+            stderr(&refused)
+        );
+    }
 }
