@@ -37,7 +37,7 @@ pub struct Outputs {
     /// The frames of the film per second of simulated time.
     #[cfg_attr(
         not(feature = "video"),
-        expect(dead_code, reason = "a build without films refuses them")
+        allow(dead_code, reason = "a build without films refuses them")
     )]
     pub fps: u32,
     /// Whether the score is printed as JSON.

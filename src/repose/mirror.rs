@@ -72,9 +72,9 @@ impl Mirror {
 
     /// Mirrors an observation in place.
     pub fn apply(&self, observation: &mut [f32]) {
-        self.signs
-            .iter()
-            .for_each(|&i| observation[i] = -observation[i]);
+        for &i in &self.signs {
+            observation[i] = -observation[i];
+        }
         for &(at, turn) in &self.tips {
             let turned = quat::mul(quat::read(observation, at), turn.map(|x| x as f32));
             observation[at..at + 4].copy_from_slice(&turned);

@@ -183,9 +183,9 @@ impl Played<'_> {
 
     fn reward(&self) -> TaskReward {
         let mut total = TaskReward::default();
-        self.episodes
-            .iter()
-            .for_each(|episode| add(&mut total, episode.reward));
+        for episode in self.episodes {
+            add(&mut total, episode.reward);
+        }
         total
     }
 

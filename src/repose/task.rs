@@ -232,9 +232,9 @@ impl Task {
 
     /// Tells the user where the policy does not fit well.
     pub fn say_warnings(&self) {
-        self.warnings
-            .iter()
-            .for_each(|warning| os::say!("warning: {warning}"));
+        for warning in &self.warnings {
+            os::say!("warning: {warning}");
+        }
     }
 
     /// A table of what was found in the scene, and in what order.

@@ -3,7 +3,8 @@
 pub(super) use mujoco_rs::mujoco_c::{
     _mjtGeomBase::*, _mjtObjBase::*, mjtBias::*, mjtBuiltin::*, mjtCone::*, mjtDisableBit::*,
     mjtDyn::*, mjtEnableBit::*, mjtEq::*, mjtGain::*, mjtGeomInertia::*, mjtIntegrator::*,
-    mjtJoint::*, mjtLightType::*, mjtState::*, mjtTexture::*, mjtTrn::*, mjtWarning::*, mjtWrap::*,
+    mjtJacobian::*, mjtJoint::*, mjtLightType::*, mjtState::*, mjtTexture::*, mjtTrn::*,
+    mjtWarning::*, mjtWrap::*,
 };
 
 /// The ids of all elements of a kind, of which a model has this number.

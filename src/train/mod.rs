@@ -81,10 +81,9 @@ fn lead(args: &TrainArgs, requests: &Requests, exchange: &Exchange) -> Result<Ex
         if !args.quiet {
             say!("{}", check.table.trim_end());
         }
-        check
-            .warnings
-            .iter()
-            .for_each(|text| say!("warning: {text}"));
+        for text in &check.warnings {
+            say!("warning: {text}");
+        }
     }
     if !args.quiet {
         let mut notes = session.task.notes();

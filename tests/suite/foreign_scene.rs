@@ -186,6 +186,11 @@ fn the_fingerprint_sees_servos_pairs_and_limits_and_that_of_the_builtin_scene_st
         assert_eq!(builtin, "bdf8dcb5");
     }
     assert_eq!(print(&[]), builtin);
+    // How MuJoCo stores Jacobians changes no motion.
+    assert_eq!(
+        print(&[("jacobian=\"sparse\"", "jacobian=\"dense\"")]),
+        builtin
+    );
     for servo in ["armature=\".01\"", "damping=\".1\""] {
         let own = SERVO.replace("/>", &format!(" {servo}/>"));
         assert_ne!(print(&[(SERVO, &own)]), builtin, "{servo}");

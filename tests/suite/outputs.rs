@@ -196,7 +196,7 @@ fn a_trace_that_is_interrupted_leaves_nothing_behind() {
 fn a_fatal_error_of_mujoco_leaves_no_unfinished_file() {
     let place = tempfile::tempdir().unwrap();
     let folder = place.path();
-    let little = SCENE.replace("memory=\"2M\"", "memory=\"60K\"");
+    let little = SCENE.replace("memory=\"2M\"", "memory=\"45K\"");
     fs::write(folder.join("small.xml"), little).unwrap();
     let play = [
         "play",

@@ -618,7 +618,7 @@ fn a_fatal_error_of_mujoco_in_an_evaluation_names_the_episode() {
     let folder = tempfile::tempdir().unwrap();
     fs::write(
         folder.path().join("small.xml"),
-        SCENE.replace("memory=\"2M\"", "memory=\"80K\""),
+        SCENE.replace("memory=\"2M\"", "memory=\"50K\""),
     )
     .unwrap();
     let args = [
