@@ -21,8 +21,8 @@ macro_rules! unusual {
 }
 
 /// A checksum (CRC-32), as hexadecimal digits, of everything in a scene that changes its motion. Geoms that collide with
-/// nothing are left out, and so are sensors, keyframes, plugins and the storage of Jacobians. The quantities of the second list count only where they are
-/// unusual, so that the checksum of other scenes stays the same when the list grows.
+/// nothing are left out, and so are sensors, keyframes, plugins and the storage of Jacobians. The quantities of the second list
+/// count only where they are unusual, so that the checksum of other scenes stays the same when the list grows.
 pub(super) fn fingerprint(model: &MjModel) -> String {
     let mut hasher = crc32fast::Hasher::new();
     let mut take = |parts: &[&dyn Debug]| {
