@@ -31,7 +31,7 @@ pub use lock::{Hold, LOCK, Locked};
 pub use machine::{Machine, processor_seconds, program_checksum};
 pub use meshes::hand_meshes;
 pub use output::{
-    OutputFile, final_path, is_abandoned, make_own, name_also, nicety, put_aside,
+    OutputFile, final_path, folder_of, is_abandoned, make_own, name_also, nicety, put_aside,
     remove_unfinished, sync, sync_folder, unused_name, write_whole,
 };
 pub use progress::{Bar, Status, StatusLine, count, of_all, progress_bar, span};

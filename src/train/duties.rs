@@ -30,7 +30,7 @@ pub struct Lead {
     quiet: bool,
     /// The number of steps of this session in which the physics diverged.
     diverged: u64,
-    /// Whether the warning about them was printed.
+    /// Whether a warning about them, or about predictions that diverged, was printed.
     warned: bool,
     /// The iterations in a row after which the policy had moved far more than it should.
     far: u32,
@@ -69,20 +69,15 @@ impl Lead {
 
     /// Warns of physics that diverge, once: the total follows at the end. Warns of updates that are too large.
     fn warn(&mut self, desired_kl: f64, outcome: &Outcome) {
-        let Outcome {
-            iteration,
-            steps,
-            evaluation,
-            ..
-        } = outcome;
+        let steps = &outcome.steps;
         self.diverged += steps.diverged;
         let warning = divergence(steps.diverged, steps.unpredicted, steps.steps)
-            .or_else(|| evaluation.divergence());
+            .or_else(|| outcome.evaluation.divergence());
         if let Some(warning) = warning.filter(|_| !self.warned) {
             self.warned = true;
             self.report.progress.warn(&warning);
         }
-        let is_far = desired_kl > 0.0 && iteration.update.losses.kl > FAR * desired_kl;
+        let is_far = desired_kl > 0.0 && outcome.iteration.update.losses.kl > FAR * desired_kl;
         self.far = if is_far {
             self.far.saturating_add(1)
         } else {
@@ -111,7 +106,7 @@ impl Lead {
             self.report.end(ended.is_ok());
         }
         let saved = self.saver.save_at_last(&mut self.report);
-        if self.warned {
+        if self.warned && self.diverged > 0 {
             say!("warning: {} steps of this session diverged", self.diverged);
         }
         let held = &self.saver.held;
@@ -279,13 +274,9 @@ fn before_and_after(rise: &Rise, episodes: usize) -> String {
 fn say_what_next(run: &Path, env: &EnvConfig) {
     let program = os::called_as();
     let word = os::quoted_path(run);
-    let all = run
-        .parent()
-        .filter(|all| !all.as_os_str().is_empty())
-        .unwrap_or(Path::new("."));
     say!(
         "  {program} play --ckpt {word}{}\n  {program} plot {word}\n  tensorboard --logdir {}",
         scene_option(env),
-        os::quoted_path(all)
+        os::quoted_path(os::folder_of(run))
     );
 }

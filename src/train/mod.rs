@@ -245,13 +245,16 @@ impl Session {
             return Ok((Score::of(&[], self.task.config.ctrl_dt), false));
         }
         let score = self.score(EVALUATION, requests)?;
-        let hopeful = beats(rank(&score), self.best);
-        let judged = if hopeful {
+        // After a resume from an older checkpoint, the best policy of the folder can be newer than what this run knows.
+        let known = self
+            .rise
+            .map_or(self.best, |rise| Some([rise.best[0], rise.best[1]]));
+        let judged = if beats(rank(&score), known) {
             self.score(CONFIRMATION, requests)?
         } else {
             score
         };
-        let improved = hopeful && self.take_down(&judged);
+        let improved = self.take_down(&judged);
         // While the critic learns alone, an evaluation cannot rise.
         if !self.agent.ppo.is_critic_alone(self.agent.iteration)
             && let Some(rise) = &mut self.rise
@@ -419,6 +422,16 @@ mod tests {
             assert_eq!((rank(&found), improved), (score, before != after));
             assert_eq!(session.best, Some(after));
         }
+        // As in a resume of a checkpoint from before the best evaluation.
+        session.best = Some([9.0, 0.0]);
+        session.rise = Some(Rise {
+            before: [0.0, 9.0, 0.0],
+            best: [0.0, 9.0, 0.0],
+            since: 3,
+        });
+        session.agent.iteration = 1;
+        session.evaluate(true, &now).unwrap();
+        assert_eq!(session.rise.unwrap().best[..2], confirmation);
     }
 
     #[test]

@@ -180,6 +180,22 @@ fn a_prediction_that_diverges_leaves_what_was_measured_and_is_counted() {
 }
 
 #[test]
+fn a_training_whose_predictions_diverge_speaks_of_no_diverged_physics() {
+    let folder = tempfile::tempdir().unwrap();
+    let late = [
+        "--set",
+        "env.prediction=1",
+        "--set",
+        "env.noise.joint_vel=1e9",
+        "--total-steps",
+        "512",
+    ];
+    let said = stderr(&succeeded(program(folder.path(), &train(&late))));
+    assert!(said.contains("the prediction diverged"), "{said}");
+    assert!(!said.contains("of this session diverged"), "{said}");
+}
+
+#[test]
 fn predictions_that_cannot_be_are_refused_in_a_sentence() {
     let folder = tempfile::tempdir().unwrap();
     let refused = |set: &str, expected: &str| {
