@@ -6,7 +6,7 @@ use rand_distr::{Distribution, Normal};
 use rayon::prelude::*;
 
 use crate::config::EnvConfig;
-use crate::env::Env;
+use crate::env::{End, Env};
 use crate::quat;
 use crate::repose::{Repose, Task};
 use crate::rng;
@@ -165,7 +165,7 @@ fn play(task: &Arc<Task>, episode: u64, std: f32) -> Played {
             *near |= quat::length(&apart) < reach;
         }
         if end.is_some() {
-            played.dropped = env.episode().dropped;
+            played.dropped = end == Some(End::Terminated);
             return played;
         }
     }

@@ -45,8 +45,7 @@ struct RunTable {
     table: MetricsTable,
 }
 
-/// Draws the curves. Of several runs, a run that cannot be drawn is skipped with a warning, e.g. one that was stopped in its
-/// first iteration.
+/// Draws the curves. A run that cannot be drawn is skipped with a warning, e.g. one that was stopped in its first iteration.
 ///
 /// # Errors
 /// Fails if no run has readable metrics with at least one row, if none has a requested column, or if the picture cannot be written.
@@ -64,8 +63,8 @@ pub fn plot(args: &PlotArgs) -> Result<()> {
         .iter()
         .flat_map(|(usual, other)| iter::chain([*usual], *other))
         .collect();
-    let behind = runs(&args.behind, args.along, &wanted)?;
-    let runs = runs(&args.runs, args.along, &wanted)?;
+    let behind = runs(&args.behind, args.along, &wanted);
+    let runs = runs(&args.runs, args.along, &wanted);
     expect_columns(&runs, &args.metric)?;
     ensure!(
         !args.seeds || runs.len() > 1,
@@ -141,24 +140,20 @@ fn panel(name: &str, runs: &[RunTable], window: f64, seeds: bool) -> Subplot {
 }
 
 /// Reads the table of each run once, however many names the run has, e.g. a link `latest`. Warns of each that cannot be drawn.
-///
-/// # Errors
-/// Fails if none of them can be drawn.
-fn runs(places: &[PathBuf], along: Along, wanted: &[&str]) -> Result<Vec<RunTable>> {
-    let mut runs = Vec::new();
+fn runs(places: &[PathBuf], along: Along, wanted: &[&str]) -> Vec<RunTable> {
     let mut known = HashSet::new();
-    for (i, place) in places.iter().enumerate() {
-        let whole = run::table_of(place).canonicalize();
-        if whole.is_ok_and(|whole| !known.insert(whole)) {
-            continue;
-        }
-        match RunTable::read(place, along, wanted) {
-            Ok(run) => runs.push(run),
-            Err(error) if runs.is_empty() && i + 1 == places.len() => return Err(error),
-            Err(error) => say!("warning: {error:#}; skipped"),
-        }
-    }
-    Ok(runs)
+    places
+        .iter()
+        .filter(|place| {
+            let whole = run::table_of(place).canonicalize().ok();
+            whole.is_none_or(|whole| known.insert(whole))
+        })
+        .filter_map(|place| {
+            RunTable::read(place, along, wanted)
+                .inspect_err(|error| say!("warning: {error:#}; skipped"))
+                .ok()
+        })
+        .collect()
 }
 
 /// The control steps that are averaged into a point. They are as many for all runs, so that a table with fewer rows, as in docs/curves,
@@ -171,11 +166,12 @@ fn window(runs: &[RunTable], smooth: Option<usize>) -> f64 {
     rows as f64 * in_row.fold(f64::INFINITY, f64::min)
 }
 
-/// Checks that each of these columns is in at least one run, and warns of the runs without it.
+/// Checks that there are runs, and that each of these columns is in at least one of them. Warns of the runs without it.
 ///
 /// # Errors
-/// Fails on the first column that no run has, and names the nearest ones.
+/// Fails without runs. Fails on the first column that no run has, and names the nearest ones.
 fn expect_columns(runs: &[RunTable], metrics: &[String]) -> Result<()> {
+    ensure!(!runs.is_empty(), "no run can be drawn");
     for name in metrics {
         let lacking = runs
             .iter()

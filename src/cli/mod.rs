@@ -238,7 +238,7 @@ pub struct PlayArgs {
     #[arg(long, help_heading = OUTPUT)]
     pub robustness: bool,
     /// Write a film (.mp4, .gif), a file for any browser (.html; at most 20 episodes), the first episodes as JSON lines (.jsonl,
-    /// .jsonl.gz; at least 2000 records), or the table of --robustness (.svg, .png); repeatable; jsonl:FILE names the format of a
+    /// .jsonl.gz; until 2000 records), or the table of --robustness (.svg, .png); repeatable; jsonl:FILE names the format of a
     /// FILE without an extension
     #[arg(long, value_name = "FILE", help_heading = OUTPUT, value_parser = destination(&["mp4", "gif", "html", "jsonl", "svg", "png"]))]
     pub out: Vec<Destination>,
@@ -301,7 +301,7 @@ pub struct ViewArgs {
     #[arg(long, value_name = "FILE", value_parser = destination(&["png"]), help_heading = OUTPUT)]
     pub out: Option<Destination>,
     /// Check whether the hand can learn, print a table with a verdict in each row, and exit
-    #[arg(long, help_heading = OUTPUT)]
+    #[arg(long, conflicts_with_all = ["out", "actions"], help_heading = OUTPUT)]
     pub check: bool,
     /// Fetch the meshes of the hand and exit, to show them later without a network
     #[arg(long, exclusive = true)]

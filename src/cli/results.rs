@@ -23,8 +23,8 @@ pub struct PlotArgs {
     /// Quantity on the x axis: control steps, or hours of collecting and learning
     #[arg(long, value_enum, default_value_t = Along::Steps)]
     pub along: Along,
-    /// Number of iterations averaged into each point; if runs differ in iteration length, the shortest length counts [default: a
-    /// tenth of the shortest run, at most 50]
+    /// Number of iterations averaged into each point, each as long as the first one; if runs differ, the shortest length counts
+    /// [default: a tenth of the shortest run, at most 50]
     #[arg(long, value_name = "N", value_parser = count())]
     pub smooth: Option<usize>,
     /// Runs, or tables, to draw in grey and without their names, behind the others

@@ -26,6 +26,7 @@ impl Destination {
         };
         if let Some((begin, path)) = name.to_str().and_then(|name| name.split_once(':'))
             && let Some(ending) = known(begin)
+            && !path.is_empty()
         {
             return Ok(Self {
                 ending,
@@ -71,7 +72,15 @@ mod tests {
         assert_eq!(found("x.jsonl.gz"), ("jsonl", "x.jsonl.gz".into()));
         assert_eq!(found("jsonl:/dev/stdout"), ("jsonl", "/dev/stdout".into()));
         assert_eq!(found("./jsonl:x.html"), ("html", "./jsonl:x.html".into()));
-        for name in ["x", "x.gif", "x.html.gz", "gif:x", "jsonl", ".html"] {
+        for name in [
+            "x",
+            "x.gif",
+            "x.html.gz",
+            "gif:x",
+            "jsonl",
+            "jsonl:",
+            ".html",
+        ] {
             let refused = "it must end in .html or .jsonl; html:FILE names the kind of a file without an ending";
             assert_eq!(parse(name).unwrap_err(), refused, "{name}");
         }

@@ -23,7 +23,7 @@ pub const MOST: u32 = 32_767;
 /// The scene of a task, and where the numbers of a row are.
 pub struct Columns {
     /// The task, which was loaded for display.
-    task: Arc<Task>,
+    pub task: Arc<Task>,
     /// Its numbers at the start are the poses in which nothing has moved, with the goal in its place. Mocap bodies other than the
     /// goal stay.
     drawing: Drawing,

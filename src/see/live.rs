@@ -136,7 +136,11 @@ impl Live {
                         paused = true;
                         single += 1;
                     }
-                    _ => self.obey(*order),
+                    _ => {
+                        self.obey(*order);
+                        // A pause shows a new goal or episode by a step.
+                        single += u32::from(matches!(order, Order::Goal | Order::Episode));
+                    }
                 }
             }
             let due = if paused {
@@ -155,12 +159,9 @@ impl Live {
                     }
                 }
                 steps += 1;
-                if steps.is_multiple_of(self.every) {
+                if paused || steps.is_multiple_of(self.every) {
                     self.send_row(start);
                 }
-            }
-            if paused && !orders.is_empty() {
-                self.send_row(start);
             }
             sleep(TICK);
         }
@@ -197,7 +198,7 @@ impl Live {
 
     fn begin(&mut self, hand: usize, episode: usize, acting: LiveActor) {
         let size = |task: &Task| task.config.cube_size_scale;
-        if size(&acting.task) != size(&self.hands[hand].acting.task) {
+        if size(&acting.task) != size(&self.columns.task) {
             self.redraw(&acting.task);
         }
         self.hands[hand] = LiveHand::new(acting, episode, self.episodes);

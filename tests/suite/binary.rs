@@ -677,7 +677,7 @@ fn learning_curves_are_drawn_of_any_columns_and_runs() {
             && svg.contains("width=\"400\"")
             && !svg.contains("goals")
     );
-    // Among several runs, runs without rows are left out. Alone they are an error.
+    // Runs without rows are left out. Alone they are an error.
     fs::create_dir(folder.path().join("begun")).unwrap();
     let header = fs::read_to_string(folder.path().join("run/metrics.csv"))
         .unwrap()
@@ -697,12 +697,20 @@ fn learning_curves_are_drawn_of_any_columns_and_runs() {
     ] {
         assert!(said.contains(part), "{part} is not in {said}");
     }
-    let refused = program(folder.path(), &["plot", "nowhere", "begun"]);
-    assert!(
-        refused.status.code() == Some(1) && stderr(&refused).contains("error: begun"),
-        "{}",
-        stderr(&refused)
-    );
+    succeeded(program(
+        folder.path(),
+        &["plot", "run", "--behind", "begun"],
+    ));
+    for other in ["nowhere", "begun/metrics.csv"] {
+        let refused = program(folder.path(), &["plot", "begun", other]);
+        let said = stderr(&refused);
+        assert!(
+            refused.status.code() == Some(1)
+                && said.contains("begun: no rows yet; skipped")
+                && said.contains("error: no run can be drawn"),
+            "{said}"
+        );
+    }
     for (more, part) in [
         (
             ["--metric", "loss/vaule"],

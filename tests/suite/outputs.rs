@@ -563,6 +563,17 @@ fn a_training_or_a_score_that_mostly_diverges_says_so() {
     );
     let score: serde_json::Value = serde_json::from_slice(&output.stdout).unwrap();
     assert_eq!(score["diverged"], 4);
+    let args = [
+        &["view", "--check", "--set", "env.model=heavy.xml"][..],
+        &sets[..],
+    ]
+    .concat();
+    let table = stderr(&succeeded(program(folder, &args)));
+    let held = table
+        .lines()
+        .find(|line| line.starts_with("zero actions hold it"))
+        .expect(&table);
+    assert!(!held.ends_with("good"), "{table}");
 }
 
 #[test]

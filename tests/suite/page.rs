@@ -1132,6 +1132,14 @@ fn options_of_a_page_that_do_not_go_together_are_refused() {
         ),
         (&["view", "--web", "--out", "x.png"], "cannot be used with"),
         (
+            &["view", "--check", "--out", "x.png"],
+            "cannot be used with",
+        ),
+        (
+            &["view", "--check", "--actions", "wave"],
+            "cannot be used with",
+        ),
+        (
             &["view", "--web-host", "h", "--out", "x.png"],
             "it applies only to a page in a browser (--web)",
         ),
