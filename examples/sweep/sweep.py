@@ -167,11 +167,6 @@ class Run:
         """Returns the control steps that it has made."""
         return steps_of(self.newest() or self.fork)
 
-    def steps_per_iteration(self):
-        progress = progress_of(self.newest())
-        begun = progress.get("fork", {"iteration": 0, "env_steps": 0})
-        return (progress["env_steps"] - begun["env_steps"]) // max(progress["iteration"] - begun["iteration"], 1)
-
     def pause(self):
         """Returns the steps at which it pauses next, or None at its end."""
         position = self.position()
@@ -194,8 +189,10 @@ class Run:
         """At a pause, copies the checkpoint if the copy is wanted and does not exist yet."""
         if not self.newest():
             return
-        position = self.position()
-        passed = [at for at in self.pauses if at <= position < at + self.steps_per_iteration()]
+        log, position = self.log(), self.position()
+        # The steps of its iterations, which can grow longer.
+        made = log.steps if log else []
+        passed = [at for at in self.pauses if position == next((steps for steps in made if steps >= at), None)]
         if not passed or passed[-1] not in self.sweep.keep:
             return
         copy = self.sweep.folder / "kept" / f"{self.variant}-{self.seed}-{passed[-1]}.safetensors"

@@ -109,6 +109,24 @@ fn a_sweep_is_killed_goes_on_and_compares_its_variants_with_the_base() {
 }
 
 #[test]
+fn a_sweep_keeps_a_checkpoint_although_its_iteration_is_longer_than_the_ones_before() {
+    if !has_python() {
+        return;
+    }
+    let place = tempfile::tempdir().unwrap();
+    let folder = place.path();
+    // The first iteration has 128 steps, the second one 512.
+    let what = format!(
+        "steps = 1000\nseeds = [0]\nkeep = [300]\nset = {:?}\n",
+        [SMALL, &["ppo.horizon={ from = 8, to = 64, steps = 256 }"]].concat()
+    );
+    fs::write(folder.join("what.toml"), what).unwrap();
+    succeeded(sweep(folder).output().unwrap());
+    assert_eq!(metrics(&folder.join("runs/base-0"))[2][1], "640");
+    assert_eq!(names(&folder.join("runs/kept")), ["base-0-300.safetensors"]);
+}
+
+#[test]
 fn a_variant_that_fails_is_named_and_the_others_are_trained() {
     if !has_python() {
         return;
