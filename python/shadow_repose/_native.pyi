@@ -11,6 +11,7 @@ class Hands:
     warnings: list[str]
     notes: list[str]
     can_step: bool
+    needs_reset: bool
     def __init__(
         self, count: int, threads: int, seed: int, said: tuple[Any, ...], parts: tuple[Any, ...] | None, training: bool, autoreset: str,
         truncates: bool, terms: bool,

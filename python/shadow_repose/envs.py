@@ -168,7 +168,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
             final_obs `[N, O]`: the last observations of the environments where `terminated` or `truncated` is set (SAME_STEP only);
             final_info: `episode` describes the episodes that ended: `r` the sum of rewards, `l` steps, `goals` reached, `dropped`,
                 `diverged`, `randomized`, `rot_dist` mean rotation error (rad), `reward` the sums of the task's terms;
-            redirected `[N]`, without a mask: where the goal was replaced;
+            redirected `[N]`: where the goal was replaced;
             reward, rot_dist (with `reward_terms`): the terms of this step's reward, weighted as in it, and the rotation errors (rad)
                 after it.
 
@@ -187,7 +187,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
             if episodes is not None:
                 info.update(_masked({"final_info": {"episode": episodes}}, over))
             if redirected.any():
-                info["redirected"] = redirected
+                info.update(_masked({"redirected": redirected}, redirected))
         if terms is not None:
             info.update(_masked({"reward": terms[0], "rot_dist": terms[1]}, np.ones(self.num_envs, np.bool_)))
         return observations, rewards, terminated, truncated, info
@@ -268,8 +268,10 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         return {**self.__dict__, "_hands": state}
 
     def __setstate__(self, pickled: dict[str, Any]) -> None:
-        self.__dict__.update(pickled)
+        self.__dict__.update({**pickled, "_hands": None})
         state = pickled["_hands"]
+        if self._made["threads"] > 16 * (os.cpu_count() or 1):  # the program refuses so many
+            self._made = {**self._made, "threads": 0}
         hands = self._create((None, None, [], []), self._parts)
         if not np.array_equal(_identity(hands), self._task):
             raise ValueError("the copy would be another task: another MuJoCo, or a scene that reads a file which has changed")
@@ -334,22 +336,18 @@ class Env(gymnasium.Env):
         self.observation_space, self.action_space = self.vector.single_observation_space, self.vector.single_action_space
         self.render_mode = render_mode
         self.metadata = {**self.metadata, "render_fps": self.vector.metadata["render_fps"]}
-        self._over = True
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
         """Starts an episode: the first one of `seed`, or the next one. Returns its observation `[O]`."""
         super().reset(seed=seed)
         observations, info = self.vector.reset(seed=seed)
-        self._over = False
         return observations[0], info
 
     def step(self, action: ArrayLike) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Steps once with an action `[A]`, which is clipped to [-1, 1]. Raises ResetNeeded after the end of an episode."""
-        if self._over:
-            self.vector._open()
+        if self.vector._open().needs_reset:
             raise ResetNeeded("the episode is over: reset the hand before it steps")
         observations, rewards, terminated, truncated, info = self.vector.step(_numbers(action, self.action_space.shape)[None])
-        self._over = bool(terminated[0] or truncated[0])
         return observations[0], float(rewards[0]), bool(terminated[0]), bool(truncated[0]), _first(info)
 
     def render(self) -> np.ndarray | None:

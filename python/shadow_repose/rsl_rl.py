@@ -2,14 +2,14 @@
 
     from rsl_rl.runners import OnPolicyRunner
     from shadow_repose import VectorEnv
-    from shadow_repose.rsl_rl import RslRlVecEnv
+    from shadow_repose.rsl_rl import RslRlVecEnv, policy
 
     envs = RslRlVecEnv(VectorEnv(1024, training=True, goal_change="truncate", random_age=True), device="cuda")
     runner = OnPolicyRunner(envs, train_cfg, log_dir="logs", device="cuda")
     runner.learn(1000)
     policy(runner).save("rsl_rl.safetensors")   # what `play`, `export` and `Policy.load` take
 
-The observations are the group `policy`: `"obs_groups": {"actor": ["policy"], "critic": ["policy"]}`.
+`train_cfg` is a configuration of rsl_rl. The observations are the group `policy`: `"obs_groups": {"actor": ["policy"], "critic": ["policy"]}`.
 """
 from __future__ import annotations
 

@@ -2,7 +2,7 @@
 
     from stable_baselines3 import PPO
     from shadow_repose import VectorEnv
-    from shadow_repose.sb3 import Sb3VecEnv
+    from shadow_repose.sb3 import Sb3VecEnv, policy
 
     envs = Sb3VecEnv(VectorEnv(256, training=True, goal_change="truncate", random_age=True))
     model = PPO("MlpPolicy", envs, n_steps=16, batch_size=1024).learn(1_000_000)

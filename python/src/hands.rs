@@ -133,6 +133,14 @@ impl Hands {
         self.made.task.clone()
     }
 
+    /// The same task for another policy.
+    ///
+    /// # Errors
+    /// Fails if the policy is for another hand.
+    pub(crate) fn task_for(&self, policy: &Record) -> anyhow::Result<Arc<Task>> {
+        self.made.task_for(policy)
+    }
+
     /// What a policy that has learnt here learnt: the settings with the present smoothing of actions, the hand, the fingerprint of the
     /// scene, and the control steps so far.
     ///
@@ -527,6 +535,15 @@ impl Hands {
             .locked()?
             .as_ref()
             .is_some_and(|state| state.can_step.is_ok()))
+    }
+
+    /// Whether an episode must be reset before the next step: it has not begun, or is over and no other one begins by itself.
+    #[getter]
+    fn needs_reset(&self) -> PyResult<bool> {
+        let guard = self.locked()?;
+        let state = guard.as_ref().expect("not closed");
+        let waits = self.autoreset == Autoreset::Disabled && state.waiting().contains(&true);
+        Ok(waits || state.can_step.is_err())
     }
 
     #[getter]

@@ -138,14 +138,13 @@ pub(crate) fn evaluate(
             "episodes = {episodes}: must lie in [1, {most}]"
         )));
     }
-    let of_hands = hands.map(Hands::task);
     let policy = scored.cast_bound::<Policy>(py).ok().map(Bound::get);
     let raised = Mutex::new(None);
     let played = Workers::new(threads).long(py, |stop| {
         let set = overrides(set, false)?;
-        let task = match (policy, &of_hands) {
-            (Some(policy), Some(task)) => task.clone().for_policy(&policy.loaded.record)?,
-            (None, Some(task)) => task.clone(),
+        let task = match (policy, hands) {
+            (Some(policy), Some(hands)) => hands.task_for(&policy.loaded.record)?,
+            (None, Some(hands)) => hands.task(),
             (Some(policy), None) => policy.loaded.task(&policy.with(&set))?,
             (None, None) => resolve(None, &set, &[])?.task,
         };

@@ -71,6 +71,20 @@ impl Made {
         Ok(Self::new(whole, task, record))
     }
 
+    /// Its task for another policy.
+    ///
+    /// # Errors
+    /// Fails if the policy is for another hand.
+    pub(crate) fn task_for(&self, policy: &Record) -> Result<Arc<Task>> {
+        if self.record.is_none() {
+            return self.task.clone().for_policy(policy);
+        }
+        // The task of a policy has taken over what that policy observes.
+        let (settings, model, _, predicted, files) = self.parts(&self.config);
+        let plain = Self::of((settings, model, None, predicted, files))?;
+        plain.task.for_policy(policy)
+    }
+
     /// A task and all settings, with those of the task as the scene has settled them.
     pub(crate) fn new(whole: Config, task: Arc<Task>, record: Option<Record>) -> Self {
         let env = task.config.clone();

@@ -194,3 +194,12 @@ def test_a_name_that_is_not_utf_8_is_refused_in_a_sentence(tmp_path, name):
     scene.write_bytes(HAND.replace(f'"{name}"', '"\udce9"').encode(errors="surrogateescape"))
     with pytest.raises(ValueError, match="UTF-8"):
         VectorEnv(1, set={"env.model": scene})
+
+
+def test_a_copy_on_a_machine_with_fewer_cores_takes_as_many_threads_as_it_has(monkeypatch):
+    envs = VectorEnv(2, threads=17)
+    envs.reset(seed=1)
+    pickled, given = pickle.dumps(envs), np.zeros((2, 20))
+    monkeypatch.setattr(os, "cpu_count", lambda: 1)
+    assert np.array_equal(pickle.loads(pickled).step(given)[0], envs.step(given)[0])
+    assert pickle.loads(pickled)._made["threads"] == 0

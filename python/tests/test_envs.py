@@ -5,6 +5,7 @@ import pickle
 
 import numpy as np
 import pytest
+from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode
 
 from shadow_repose import Env, Policy, VectorEnv
@@ -238,6 +239,23 @@ def test_a_mask_restarts_some_hands_and_leaves_the_others():
         envs.reset(seed=1, options={"reset_mask": mask})
 
 
+def test_one_environment_continues_from_a_state_before_and_after_the_end_of_an_episode():
+    env, still = Env(set=SHORT), np.zeros(20)
+    env.reset(seed=1)
+    running = env.vector.get_state()
+    while not env.step(still)[3]:
+        pass
+    over = env.vector.get_state()
+    for other in (env, Env(set=SHORT)):
+        other.vector.set_state(running)
+        assert not other.step(still)[3]
+        other.vector.set_state(over)
+        with pytest.raises(ResetNeeded):
+            other.step(still)
+        other.reset()
+        other.step(still)
+
+
 def test_a_new_goal_goes_on_or_truncates_as_it_is_asked():
     often = {"training.goal_lifetime": 3, "env.max_episode_seconds": 1.0, "env.fall_dist": 10.0}
     made = {"num_envs": 16, "set": often, "training": True, "seed": 1}
@@ -249,7 +267,9 @@ def test_a_new_goal_goes_on_or_truncates_as_it_is_asked():
     for given in actions(60, 16):
         one, other = goes_on.step(given), cuts.step(given)
         assert np.array_equal(one[0], other[0]) and np.array_equal(one[1], other[1])
-        assert not one[3].any() and np.array_equal(other[3], other[4].get("redirected", np.zeros(16, bool)))
+        assert not one[3].any()
+        for name in ("redirected", "_redirected"):
+            assert np.array_equal(other[3], other[4].get(name, np.zeros(16, bool)))
         assert "final_obs" not in one[4] and "final_info" not in other[4]
         if other[3].any():
             redirected += other[3].sum()

@@ -222,6 +222,12 @@ def test_a_net_that_was_learnt_elsewhere_is_a_policy_with_its_own_normaliser_and
     assert evaluate(lambda seen: policy(seen), episodes=3) != by_net
 
 
+def test_environments_for_one_policy_score_another():
+    own, others = (VectorEnv(1, policy=policy, set={"env.max_episode_seconds": 0.5}) for policy in ("builtin", "robust"))
+    for policy in ("builtin", "robust"):
+        assert evaluate(policy, envs=own, episodes=2) == evaluate(policy, envs=others, episodes=2)
+
+
 def test_what_does_not_fit_the_task_is_no_policy():
     envs = VectorEnv(1)
     for wrong, layers, how in (
@@ -294,3 +300,15 @@ def test_an_episode_is_shown_in_a_notebook(tmp_path):
         assert "<iframe srcdoc=" in shadow_repose.show(what).data
     with pytest.raises(ValueError, match="No such file"):
         shadow_repose.show(tmp_path / "none.jsonl")
+
+
+@pytest.mark.filterwarnings("ignore:an action means another angle")
+def test_an_episode_of_a_hand_of_your_own_is_shown_by_its_policy_and_by_its_trace(other_ranges, tmp_path):
+    pytest.importorskip("IPython")
+    trace = tmp_path / "own.jsonl"
+    evaluate("builtin", episodes=1, set=other_ranges, trace=trace)
+    with pytest.raises(ValueError, match="env.model"):
+        shadow_repose.show(trace)
+    named = {"hand.object": "cube"}
+    for what, set in ((trace, {"env": {"model": other_ranges["env.model"]}}), ("builtin", {**other_ranges, **named})):
+        assert "<iframe srcdoc=" in shadow_repose.show(what, set=set).data
