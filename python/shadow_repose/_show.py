@@ -46,8 +46,9 @@ def show(
             policy = what if isinstance(what, Policy) else Policy.load(what, set=set)
             trace = str(pathlib.Path(folder, "trace.jsonl"))
             evaluate(policy, episodes=1, seed=seed, set=set, trace=trace)
-            known = {} if policy.settings["env.model"] == "builtin" else {key: policy.settings[key] for key in filter(_of_hand, policy.settings)}
-            said = [*pairs(known), *((key, text) for key, text in said if _of_hand(key))]
+            known = pairs({key: value for key, value in policy.settings.items() if _of_hand(key)})
+            own = [] if policy.settings["env.model"] == "builtin" else known
+            said = [*own, *((key, text) for key, text in said if _of_hand(key))]
         words += [word for key, text in said for word in ("--set", f"{key}={text}")]
         command = [program(), "play", "--from-trace", trace, "--out", str(page), *words]
         made = subprocess.run(command, capture_output=True, text=True)
