@@ -171,7 +171,9 @@ impl Simulation {
 
     /// The angle between what carries a body and a floor under it, rad: between the mean normal of the contacts at its tree of bodies,
     /// in proportion to their forces, and the direction against gravity. Returns `None` if nothing presses against it, or without gravity.
-    pub fn tilt(&self, Body(id): Body) -> Option<f64> {
+    pub fn tilt(&mut self, Body(id): Body) -> Option<f64> {
+        // A step ends with contacts without forces.
+        self.compute(|data| data.forward());
         let model = self.data.model();
         let own = |geom: i32| {
             let body = model.geom_bodyid().get(geom as usize);
