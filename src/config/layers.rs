@@ -81,11 +81,12 @@ impl Reader {
         let asked = sets.iter().rev().find_map(|Override { key, value }| {
             lookup(&table_of(key, value, &DEFAULTS), MODEL).cloned()
         });
-        let is_kept = |place: &Value| match &*stored {
-            BUILTIN_MODEL => *place != DEFAULTS["env"]["goal_position"],
-            stored => asked
-                .as_ref()
-                .is_none_or(|asked| names_scene(asked, stored)),
+        let is_kept = |place: &Value| {
+            let is_own = stored != BUILTIN_MODEL || *place != DEFAULTS["env"]["goal_position"];
+            is_own
+                && asked
+                    .as_ref()
+                    .is_none_or(|asked| names_scene(asked, &stored))
         };
         table.retain(|section, _| ["env", "hand", "ppo"].contains(&section));
         for (section, keys) in &mut table {
@@ -469,6 +470,20 @@ mod tests {
                     .unwrap();
                 assert_eq!(config.env.goal_position.named, is_kept, "{form}");
             }
+        }
+    }
+
+    #[test]
+    fn a_place_in_the_built_in_scene_is_no_place_in_another_one() {
+        let stored = "[env]\ngoal_position = [1, 2, 3]";
+        for (model, is_kept) in [("builtin", true), ("own.xml", false)] {
+            let player = Reader::Player { env_steps: 0 };
+            let config = Settings::new()
+                .stored(file(stored), player)
+                .sets(&[set(&format!("env.model={model}"))])
+                .resolve()
+                .unwrap();
+            assert_eq!(config.env.goal_position.named, is_kept, "{model}");
         }
     }
 

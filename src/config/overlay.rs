@@ -96,11 +96,11 @@ fn with_zeros(text: &str) -> String {
     filled
 }
 
-/// Whether a value of `env.model` names the scene at the absolute path `stored`.
+/// Whether a value of `env.model` names `stored`: the built-in scene, or the scene at this absolute path.
 pub fn names_scene(asked: &Value, stored: &str) -> bool {
     asked.as_str().is_some_and(|asked| {
         let file = Path::new(asked).canonicalize();
-        file.is_ok_and(|file| file == Path::new(stored))
+        asked == stored || file.is_ok_and(|file| file == Path::new(stored))
     })
 }
 
