@@ -170,6 +170,9 @@ class Recording {
   /** Returns the rows as text and the entries of `meta` that belong to them. */
   async write() {
     const { rows, hands, width } = this, columns = hands * width, counters = ["step", "held", "goals"].map((name) => this.place[name]);
+    if (rows.some((row) => row.some((value, i) => counters.includes(i % width) && value > 32767))) {
+      throw new Error("an episode has more than 32767 steps");
+    }
     const scale = Array.from({ length: columns }, (_, i) => {
       if (counters.includes(i % width)) return 1;
       return rows.reduce((most, row) => Math.max(most, Math.abs(row[i])), 1e-9) / 32767;

@@ -100,7 +100,7 @@ class Player {
     this.facts = new Facts(recording);
     this.rewards = new Rewards(recording);
     this.lists = new Lists(recording, (row) => this.seek(row), (hand) => this.choose(hand));
-    const moment = asked("t");
+    const moment = parseFloat(asked("t"));
     if (moment) [this.now, this.playing] = [Math.min(recording.last, moment / recording.period), false];
     this.listen();
     this.resize();
@@ -141,7 +141,7 @@ class Player {
     byId("home").onclick = () => this.orbit.reset();
     byId("live").onclick = () => { this.playing = this.following = this.dirty = true; };
     addEventListener("keydown", (event) => this.key(event));
-    addEventListener("hashchange", () => { if (asked("t")) this.seek(asked("t") / this.recording.period, true); });
+    addEventListener("hashchange", () => { const moment = parseFloat(asked("t")); if (moment >= 0) this.seek(moment / this.recording.period, true); });
     new ResizeObserver(() => this.resize()).observe(byId("stage"));
     matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => this.resize());
   }
@@ -268,7 +268,8 @@ class Player {
 
   /** Puts the word "goal" over the goal, which is of glass. */
   drawGoal() {
-    const label = byId("goal"), { recording, screen, poses } = this, glass = this.scene.geoms.find(({ rgba }) => rgba[3] < 1);
+    const label = byId("goal"), { recording, screen, poses, scene } = this;
+    const glass = scene.geoms.find(({ body, rgba }) => rgba[3] < 1 && scene.bodies[body].mocap >= 0);
     label.hidden = !glass || !recording.has("goals") || recording.hands > 1;
     if (label.hidden) return;
     const [x, y, z] = poses.subarray(8 * glass.body), { clientWidth, clientHeight } = screen.canvas;
@@ -283,6 +284,7 @@ class Player {
     put(byId("clock"), `${(step * recording.meta.dt).toFixed(2)} s, step ${step}`);
     put(byId("play"), this.playing ? "Pause" : "Play");
     byId("live").hidden = !this.live || this.following;
+    byId("speed").disabled = this.following;
   }
 }
 

@@ -56,6 +56,8 @@ pub struct Live {
     every: u64,
     episodes: Episodes,
     hands: Vec<LiveHand>,
+    /// The newest row, as it was sent.
+    row: String,
 }
 
 /// A hand on the page.
@@ -113,6 +115,7 @@ impl Live {
             every,
             episodes,
             hands,
+            row: String::new(),
         })
     }
 
@@ -218,10 +221,12 @@ impl Live {
         self.key = page.key();
         self.server.replace_page(page.html());
         self.server.send(&self.hello());
+        // No hand goes on in the old shapes.
+        self.hands.iter_mut().for_each(|hand| hand.has_ended = true);
     }
 
     fn hello(&self) -> String {
-        hello(&self.key, &self.hands, &self.sliders)
+        hello(&self.key, &self.hands, &self.sliders) + &self.row
     }
 
     /// Sends the row of all hands, as the page reads it.
@@ -235,7 +240,9 @@ impl Live {
             .collect();
         let row = BASE64_STANDARD.encode(bytes);
         let time = start.elapsed().as_millis();
-        self.server.send(&format!("id: {time}\ndata: {row}\n\n"));
+        self.row = format!("id: {time}\ndata: {row}\n\n");
+        self.server.send(&self.row);
+        self.server.greet(&self.hello());
     }
 }
 

@@ -29,4 +29,6 @@ if (lists.length) {
 const { text, entries } = await recording.write(), again = await page.Recording.read({ ...meta, ...entries }, text);
 assert.equal(again.rows.length, recording.rows.length);
 recording.rows.forEach((row, r) => row.forEach((value, i) => assert(Math.abs(value - again.rows[r][i]) <= .51 * entries.scale[i])));
+recording.rows.at(-1)[recording.place.step] = 32768;
+await assert.rejects(recording.write(), /more than 32767 steps/, "a counter that the file cannot hold");
 console.log(JSON.stringify({ far, turned, episodes: recording.episodes[0].length }));

@@ -730,6 +730,32 @@ fn a_live_page_is_fed_by_the_hands_that_play_and_says_what_a_file_says() {
 }
 
 #[test]
+fn who_comes_while_a_live_page_rests_sees_its_newest_row() {
+    let folder = tempfile::tempdir().unwrap();
+    let live = Live::start(
+        folder.path(),
+        &["play", "--ckpt", "random", "--web", "0", "--plain"],
+    );
+    let mut events = live.events();
+    events.row();
+    let own = format!("127.0.0.1:{}", live.port);
+    let order = "\"pause\"";
+    let length = order.len();
+    let request = format!(
+        "POST /controls HTTP/1.1\r\nHost: {own}\r\nOrigin: http://{own}\r\nContent-Type: application/json\r\n\
+         Content-Length: {length}\r\n\r\n{order}"
+    );
+    assert_eq!(status(&live.ask(request.as_bytes())), "204");
+    std::thread::sleep(Duration::from_millis(500));
+    let rows = [(); 2].map(|()| {
+        let mut late = live.events();
+        late.next("hello");
+        late.row()
+    });
+    assert_eq!(rows[0], rows[1]);
+}
+
+#[test]
 fn a_slider_moves_an_actuator_and_only_the_page_can_move_it() {
     let folder = tempfile::tempdir().unwrap();
     let live = Live::start(folder.path(), &["view", "--web", "0", "--plain"]);
