@@ -146,7 +146,9 @@ impl OutputFile {
             }
             _ => {}
         }
-        let target = end_of_links(path).cannot("write", path)?;
+        let end = end_of_links(path).cannot("write", path)?;
+        // Without a slash at its end, which would make it a folder.
+        let target: PathBuf = end.components().collect();
         if target.exists() {
             // A file that is protected from being written is not replaced.
             OpenOptions::new()
@@ -352,6 +354,16 @@ mod tests {
         write_whole(&path, b"two").unwrap();
         assert_eq!(fs::read(&path).unwrap(), b"two");
         assert_eq!(fs::read_dir(place.path()).unwrap().count(), 1);
+    }
+
+    #[test]
+    fn a_slash_behind_the_name_of_a_file_makes_it_no_folder() {
+        let place = tempfile::tempdir().unwrap();
+        for bytes in ["one", "two"] {
+            let output = OutputFile::create(&place.path().join("film.gif/")).unwrap();
+            output.finish(bytes.as_bytes()).unwrap();
+            assert_eq!(content(&place.path().join("film.gif")), bytes);
+        }
     }
 
     #[test]

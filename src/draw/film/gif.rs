@@ -26,7 +26,7 @@ pub fn encode(
     mut frames: impl Iterator<Item = Vec<u8>>,
 ) -> Result<()> {
     let [width, height] = format.size.map(|pixels| pixels as usize);
-    let most = BYTES_FOR_PALETTE / (3 * width * height).max(1);
+    let most = BYTES_FOR_PALETTE / (3 * width * height);
     let waiting: Vec<_> = frames.by_ref().take(most).collect();
     let mut palette = Palette::new(&waiting);
     let mut encoder = Encoder::new(

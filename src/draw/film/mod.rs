@@ -37,15 +37,9 @@ impl FilmWriter {
     /// Starts a film.
     ///
     /// # Errors
-    /// Fails if the file is neither an MP4 nor a GIF, for a format that the kind of file does not support, or if it cannot be written.
+    /// Fails for a format that the kind of file does not support, or if the file cannot be written.
     pub fn create(to: &Destination, format: FilmFormat) -> Result<Self> {
         let is_gif = to.ending == "gif";
-        ensure!(
-            is_gif || to.ending == "mp4",
-            "{}: a film is an .mp4 or a .gif, not a .{}",
-            to.path.display(),
-            to.ending
-        );
         let [width, height] = format.size;
         let even = width.is_multiple_of(2) && height.is_multiple_of(2);
         ensure!(

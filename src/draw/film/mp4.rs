@@ -45,6 +45,8 @@ pub fn encode(
         ..Default::default()
     })?;
     let mut file = BufWriter::new(file);
+    // The beginning is written last, which a pipe does not allow.
+    file.stream_position()?;
     file.write_all(muxer.initial_boxes_bytes())?;
     let mut data_offset = muxer.initial_boxes_bytes().len() as u64;
     for (number, rgb) in frames.enumerate() {
