@@ -82,10 +82,7 @@ impl<W> Log<W> {
             Some(Ok(())) => {
                 self.unsynced += 1;
                 if std::mem::take(&mut self.failing) {
-                    let Self { name, lost, .. } = self;
-                    progress.warn(&format!(
-                        "logging to {name} has resumed; it lacks {lost} iterations so far"
-                    ));
+                    progress.warn(&format!("logging to {} has resumed", self.name));
                 }
             }
             Some(Err(error)) => self.give_up(progress, 1, &error),

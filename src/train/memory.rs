@@ -2,6 +2,7 @@
 
 use super::session::Session;
 use crate::os::memory;
+use crate::ppo::GROUP;
 
 /// The memory for the contacts and constraints of an environment, bytes. MuJoCo reserves 2 MiB. In the hands that were tried, it
 /// uses at most 0.15 MB.
@@ -32,15 +33,12 @@ pub fn growth(session: &Session) -> usize {
         ..
     } = session;
     let spaces = task.spaces();
-    let sample = 4 * (spaces.observation_size + 2 * spaces.action_size + 8);
+    let sample = 4 * (2 * (spaces.observation_size + spaces.action_size) + 8);
     let horizon = config.ppo.horizon_at(config.run.total_steps) + 1;
     let envs = agent.pool.count();
     // The outputs of the hidden layers of a minibatch, and their gradients.
     let hidden: usize = config.ppo.hidden.iter().sum();
     let learner = 8 * config.samples_per_minibatch() * hidden * envs / config.env.num_envs;
     let models = (rayon::current_num_threads() + MODELS) * task.scene.size();
-    envs * (CONTACTS + horizon * sample)
-        + config.run.eval_episodes * (ENVIRONMENT + CONTACTS)
-        + models
-        + learner
+    envs * (CONTACTS + horizon * sample) + GROUP * (ENVIRONMENT + CONTACTS) + models + learner
 }

@@ -370,7 +370,7 @@ mod tests {
             from_scratch(&sets)
         };
         let [short, long] = ["16", "{from=16,to=160000,steps=1000}"].map(session);
-        let of_samples = 8 * (160_000 - 16) * 4 * (157 + 2 * 20 + 8);
+        let of_samples = 8 * (160_000 - 16) * 4 * (2 * (157 + 20) + 8);
         assert_eq!(memory::growth(&long) - memory::growth(&short), of_samples);
         let less = need(&short).is_none_or(|[needed, has]| 0.0 < needed && needed < has);
         assert!(less);

@@ -8,7 +8,7 @@ use anyhow::{Error, Result, anyhow};
 use crate::cli::TrainArgs;
 use crate::config::{Config, scene_option};
 use crate::load;
-use crate::os::{self, Cannot, Locked, say};
+use crate::os::{self, Cannot, Locked, say, shown};
 use crate::ppo::{Checkpoint, Fork, Progress};
 use crate::run::{Report, RunFolder};
 use crate::sim;
@@ -55,9 +55,11 @@ impl Saver {
         config: &Config,
         initial: Checkpoint,
     ) -> Self {
+        let keep = args.keep.map(|keep| format!(" --keep {keep}"));
         let options = format!(
-            "{}{}",
+            "{}{}{}",
             scene_option(&config.env),
+            keep.unwrap_or_default(),
             if args.dump_diverged {
                 " --dump-diverged"
             } else {
@@ -133,8 +135,8 @@ impl Saver {
             let aside = os::put_aside(&best, "damaged").cannot("rename", &best)?;
             report.progress.warn(&format!(
                 "{} is damaged; renamed to {}",
-                best.display(),
-                aside.display()
+                shown(&best).display(),
+                shown(&aside).display()
             ));
         }
         write(&self.held.folder, None, &self.initial, self.held.keep)?;
