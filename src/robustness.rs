@@ -224,8 +224,8 @@ fn mean_kept(rows: &[Scored]) -> f64 {
     let kept = rows
         .iter()
         .skip(1)
-        .filter(|row| !row.condition.is_in_grid())
-        .map(|row| if row.kept > 1.0 { 1.0 } else { row.kept });
+        .filter(|row| !row.condition.is_in_grid() && row.task.config != rows[0].task.config)
+        .map(|row| row.kept.clamp(0.0, 1.0));
     mean(&Vec::from_iter(kept))
 }
 
@@ -376,6 +376,10 @@ mod tests {
             .collect();
         rows.push(row(conditions[24].clone(), 2, 0.1));
         assert_eq!(mean_kept(&rows), 0.75);
+        // The second row changes nothing about a task that has half the friction anyway.
+        let friction = |kept| row(conditions[1].clone(), 2, kept);
+        let mass = row(conditions[4].clone(), 2, 0.5);
+        assert_eq!(mean_kept(&[friction(1.0), friction(1.0), mass]), 0.5);
         let of_nothing: Vec<Scored> = conditions[..3]
             .iter()
             .map(|of| row(of.clone(), 0, f64::NAN))

@@ -24,7 +24,7 @@ pub fn block_sizes(items: usize, in_all: usize) -> Vec<usize> {
 /// returns the blocks in their order.
 ///
 /// # Panics
-/// Panics if `work` does, after the other blocks have finished their rounds.
+/// Panics if `work` does.
 pub fn in_rounds<B: Send>(
     blocks: impl IntoIterator<Item = B>,
     rounds: usize,

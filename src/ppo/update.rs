@@ -1,7 +1,6 @@
 //! An update: advantages, then epochs of gradient steps on minibatches, then the normaliser.
 
 use std::f64::consts::{E, TAU};
-use std::iter::repeat_n;
 use std::ops::Add;
 use std::sync::atomic::AtomicBool;
 
@@ -251,11 +250,10 @@ impl Ppo {
             .means(steps.len());
         // The entropy of the Gaussian at noise scale 1.
         let of_action = f64::from(self.policy.log_std[0]) + 0.5 * (TAU * E).ln();
-        let entropy: f64 = repeat_n(of_action, self.policy.spaces.action_size).sum();
         UpdateStats {
             losses,
             first: steps[0].0,
-            entropy: mean(repeat_n(entropy, steps.len()).sum()),
+            entropy: of_action * self.policy.spaces.action_size as f64,
             grad_norm: mean(steps.iter().map(|(_, norm)| norm).sum()),
             std: f64::from(self.policy.std()),
             explained_variance,

@@ -48,10 +48,6 @@ enum Law {
 /// The number of sizes of the object.
 const SIZES: usize = 5;
 
-/// The quantities that one generator draws, one after another. Each later one has its own, so that a new quantity does not
-/// change what is drawn for the others.
-pub const SHARED: usize = 10;
-
 /// The changes of each of these parts, given one value for all of them or one for each.
 fn each<T: Copy>(parts: &[T], values: &[f64], change: fn(T, f64) -> Change) -> Vec<Change> {
     parts

@@ -8,7 +8,7 @@ use std::sync::Arc;
 use anyhow::{Context, Result, ensure};
 
 use super::hand::Hand;
-use super::physics::{Physics, QUANTITIES, SHARED, normal, sizes};
+use super::physics::{Physics, QUANTITIES, normal, sizes};
 use super::sensing::NoiseStd;
 use super::task::Task;
 use crate::config::RandomizationConfig;
@@ -95,16 +95,11 @@ impl Randomization {
         let shared = &mut rng::beside(rng, "randomization");
         let randomized = rng::uniform(shared, 0.0, 1.0) < probability;
         let is_varied = |rng: &mut Rng| rng::uniform(rng, 0.0, 1.0) < self.config.each;
-        let flags = [(); SHARED + 3].map(|()| is_varied(shared));
+        let flags = [(); QUANTITIES.len() + 3].map(|()| is_varied(shared));
         let mut physics = Physics::neutral(hand);
         for (i, quantity) in QUANTITIES.iter().enumerate() {
-            let (drawn, varied) = if i < SHARED {
-                (quantity.draw(&self.config, hand, shared), flags[i])
-            } else {
-                let own = &mut rng::beside(rng, quantity.name);
-                (quantity.draw(&self.config, hand, own), is_varied(own))
-            };
-            if varied {
+            let drawn = quantity.draw(&self.config, hand, shared);
+            if flags[i] {
                 physics.0[i] = drawn;
             }
         }

@@ -196,7 +196,7 @@ impl Played<'_> {
         let errors = self.episodes.iter().map(|e| f64::from(e.goals) - mean);
         let variance = errors.map(|error| error.powi(2)).sum::<f64>() / (count - 1.0);
         let margin = 1.96 * (variance / count).sqrt();
-        [mean - margin, mean + margin].map(|x| if x.is_nan() { x } else { x.max(0.0) })
+        [mean - margin, mean + margin].map(|x| x.clamp(0.0, f64::INFINITY))
     }
 }
 

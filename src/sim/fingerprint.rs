@@ -57,7 +57,7 @@ pub(super) fn fingerprint(model: &MjModel) -> String {
     let unusual = unusual! { model:
         actuator_armature 0.0, actuator_damping 0.0, actuator_dampingpoly none, dof_dampingpoly none, jnt_stiffnesspoly none,
         tendon_dampingpoly none, tendon_stiffnesspoly none, tendon_solref_lim solref, tendon_solimp_lim solimp,
-        tendon_solref_fri solref, tendon_solimp_fri solimp, tendon_margin 0.0, tendon_actfrclimited false,
+        tendon_solref_fri solref, tendon_solimp_fri solimp, tendon_margin 0.0, tendon_actfrclimited false, tendon_actfrcrange none,
         pair_solimp solimp, pair_solreffriction none
     };
     for line in unusual.into_iter().flatten() {
