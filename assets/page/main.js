@@ -6,6 +6,7 @@ const DELAY = .12; // seconds that a live picture is behind, so that uneven arri
 
 /** What the page's address asks for: #t=3.2 a moment, #picture=full, simple or flat a kind of picture. */
 const asked = (name) => new RegExp(`[#&]${name}=([\\w.]+)`).exec(location.hash)?.[1];
+const askedMoment = () => parseFloat(asked("t")); // s, or NaN
 
 /** Makes the best picture that this browser can, and another one after the graphics driver was reset. */
 class Screen {
@@ -100,7 +101,7 @@ class Player {
     this.facts = new Facts(recording);
     this.rewards = new Rewards(recording);
     this.lists = new Lists(recording, (row) => this.seek(row), (hand) => this.choose(hand));
-    const moment = parseFloat(asked("t"));
+    const moment = askedMoment();
     if (moment) [this.now, this.playing] = [Math.min(recording.last, moment / recording.period), false];
     this.listen();
     this.resize();
@@ -141,7 +142,7 @@ class Player {
     byId("home").onclick = () => this.orbit.reset();
     byId("live").onclick = () => { this.playing = this.following = this.dirty = true; };
     addEventListener("keydown", (event) => this.key(event));
-    addEventListener("hashchange", () => { const moment = parseFloat(asked("t")); if (moment >= 0) this.seek(moment / this.recording.period, true); });
+    addEventListener("hashchange", () => { if (askedMoment() >= 0) this.seek(askedMoment() / this.recording.period, true); });
     new ResizeObserver(() => this.resize()).observe(byId("stage"));
     matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => this.resize());
   }

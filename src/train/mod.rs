@@ -372,6 +372,13 @@ mod tests {
         let [short, long] = ["16", "{from=16,to=160000,steps=1000}"].map(session);
         let of_samples = 8 * (160_000 - 16) * 4 * (2 * (157 + 20) + 8);
         assert_eq!(memory::growth(&long) - memory::growth(&short), of_samples);
+        // As many environments evaluate at once, however many episodes that takes.
+        let many = from_scratch(&[
+            "env.num_envs=8".parse().unwrap(),
+            "ppo.horizon=16".parse().unwrap(),
+            "run.eval_episodes=1000000".parse().unwrap(),
+        ]);
+        assert_eq!(memory::growth(&many), memory::growth(&short));
         let less = need(&short).is_none_or(|[needed, has]| 0.0 < needed && needed < has);
         assert!(less);
     }

@@ -209,6 +209,13 @@ fn the_fingerprint_sees_servos_pairs_and_limits_and_that_of_the_builtin_scene_st
             "{limit}"
         );
     }
+    let forces = [".1", ".2"].map(|most| {
+        let tendon = format!(
+            "<fixed name=\"rh_FFJ0\" actuatorfrclimited=\"true\" actuatorfrcrange=\"-{most} {most}\">"
+        );
+        print(&[("<fixed name=\"rh_FFJ0\">", &tendon)])
+    });
+    assert_ne!(forces[0], forces[1]);
     let ball = |size: &str| {
         format!(
             "<worldbody><geom name=\"ball\" type=\"sphere\" size=\"{size}\" contype=\"0\" conaffinity=\"0\"/>"

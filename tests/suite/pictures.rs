@@ -661,6 +661,8 @@ fn pictures_and_films_that_cannot_be_are_refused() {
     if !can_draw() {
         return;
     }
+    let pipe = ["play", "--ckpt", "zero", "--out", "mp4:/dev/stdout"];
+    refused(&pipe, 1, "Illegal seek");
     let film = [
         "play",
         "--ckpt",

@@ -221,6 +221,10 @@ fn a_run_says_at_its_end_what_comes_next_in_the_way_it_was_called() {
         said.contains("\n  cargo run --release -- play --ckpt run\n"),
         "{said}"
     );
+    let stopped = ["--run-dir", "kept", "--keep", "6", "--stop-after", "1s"];
+    let said = stderr(&succeeded(program(folder.path(), &train(&stopped))));
+    let resumes = format!("{path} train --resume kept --keep 6");
+    assert!(said.lines().any(|line| line.trim() == resumes), "{said}");
     let args = train(&["--total-steps", "128", "--run-dir", "quiet", "--quiet"]);
     let said = stderr(&succeeded(program(folder.path(), &args)));
     assert!(
