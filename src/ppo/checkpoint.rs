@@ -19,9 +19,6 @@ use crate::spaces::Spaces;
 /// The text `format` of a file.
 const FORMAT: &str = "shadow-repose checkpoint 5";
 
-/// The format of files that `scripts/convert` converts.
-const CONVERTIBLE: &str = "shadow-repose checkpoint 4";
-
 /// The most bytes of a configuration that are read. Ours take one to two thousand.
 const LONGEST_CONFIG: usize = 1 << 16;
 
@@ -63,10 +60,6 @@ impl Checkpoint {
                 .with_context(|| format!("its metadata has no `{key}`"))
         };
         let format = text("format")?;
-        ensure!(
-            format != CONVERTIBLE,
-            "its format is `{format}`; `scripts/convert OLD NEW` writes it as `{FORMAT}`"
-        );
         ensure!(
             format == FORMAT,
             "its format is `{}`; this program reads `{FORMAT}`",
