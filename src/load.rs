@@ -9,11 +9,11 @@ use std::sync::Arc;
 
 use anyhow::{Context, Error, Result, ensure};
 
-use crate::config::{Config, Override, PpoConfig, Reader, Settings, Source};
+use crate::config::{Config, MODEL, Override, PpoConfig, Reader, Settings, Source};
 use crate::evaluate::Actor;
 use crate::os::{self, say};
 use crate::ppo::{Checkpoint, Damaged, Policy, Progress};
-use crate::repose::{Record, Task, is_physical, physical};
+use crate::repose::{Record, Task, physical};
 use crate::run;
 use crate::sim::SceneFiles;
 
@@ -217,17 +217,22 @@ impl Loaded {
             return Ok(task);
         }
         // Who predicts knows the physics that the policy was trained with, and what is known of the world, whatever the world is.
-        let of_world = |name: &str| is_physical(name) || name.starts_with("known");
-        let mut sets = overrides.to_vec();
-        sets.retain(|set| !set.key.strip_prefix("env.").is_some_and(of_world));
-        let own = self.settings(&sets)?.env;
-        let scales = physical(&own);
-        for (name, known) in config.env.known {
-            let key = format!("{name}_scale");
-            let scale = scales[&key].as_float().expect("a factor");
-            let factor = known / own.known.get(&name).unwrap_or(&1.0);
-            sets.push(Override::new(format!("env.{key}"), scale * factor));
+        let scene = Override::new(MODEL, &config.env.model);
+        let own = self.settings(&[scene])?.env;
+        let mut world = physical(&own);
+        if !config.env.is_multiple_of(own.sim_dt) {
+            // With the policy's step, the model would end between two control steps.
+            world.remove("sim_dt");
         }
+        for (name, known) in &config.env.known {
+            let scale = &mut world[&format!("{name}_scale")];
+            let factor = known / own.known.get(name).unwrap_or(&1.0);
+            *scale = (scale.as_float().expect("a factor") * factor).into();
+        }
+        let sets = world
+            .into_iter()
+            .map(|(name, value)| Override::new(format!("env.{name}"), value));
+        let sets = [overrides, &Vec::from_iter(sets)].concat();
         let model = Task::with_files(&self.settings(&sets)?, task.files())?;
         Ok(task.predicted_by(&model))
     }

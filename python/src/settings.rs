@@ -6,7 +6,7 @@ use std::sync::Arc;
 use anyhow::{Result, ensure};
 use serde_json::json;
 use shadow_repose::config::{BUILTIN_MODEL, Config, EnvConfig, Override, Settings, Source};
-use shadow_repose::repose::{Record, Task, is_physical};
+use shadow_repose::repose::{Record, Task, physical};
 use shadow_repose::sim::SceneFiles;
 
 /// Settings as a user gives them: dotted keys, and values in TOML.
@@ -128,8 +128,10 @@ pub(crate) fn overrides(set: Set, training: bool) -> Result<Vec<Override>> {
 /// # Errors
 /// Fails if one of them says something else.
 pub(crate) fn of_world(world: Set) -> Result<Vec<Override>> {
+    let physical = physical(&Config::default().env);
     for (key, _) in &world {
-        let is_of_world = key.strip_prefix("env.").is_some_and(is_physical);
+        let name = key.strip_prefix("env.");
+        let is_of_world = name.is_some_and(|name| physical.contains_key(name));
         ensure!(
             is_of_world,
             "{key}: `world` holds only settings that say how the hand and the object move"

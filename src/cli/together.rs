@@ -16,14 +16,16 @@ pub enum Made {
     Robustness,
     /// A film or a picture.
     Picture,
-    /// An HTML file.
+    /// An HTML file of what is played.
     Page,
+    /// An HTML file of a trace.
+    Replay,
     /// The check of a hand.
     Check,
 }
 
 /// What is made, its name, and the options that go with it. An option in no row goes with everything.
-const GO_WITH: [Row; 7] = [
+const GO_WITH: [Row; 8] = [
     (
         Made::Window,
         "a window",
@@ -52,7 +54,12 @@ const GO_WITH: [Row; 7] = [
     (
         Made::Page,
         "an HTML file (--out)",
-        "--out FILE.html, --from-trace, --camera, --plain",
+        "--out FILE.html, --camera, --plain",
+    ),
+    (
+        Made::Replay,
+        "an HTML file of a trace (--from-trace, --out FILE.html)",
+        "--from-trace, --out FILE.html, --camera, --plain",
     ),
     (Made::Check, "a check of the hand (--check)", "--check"),
 ];

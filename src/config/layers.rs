@@ -226,11 +226,14 @@ impl Settings {
             layers.lay(&table_of(key, value, &layers.merged));
         }
         let is_named = layers.named.contains(MODEL);
-        let stored = self
-            .stored
-            .map(|(source, _)| source)
-            .filter(|_| self.sets.is_empty());
-        let mut config = layers.resolve(self.file.or(stored))?;
+        let origin = match (self.file, self.stored, self.sets.is_empty()) {
+            (Some(file), _, true) | (None, Some((file, _)), true) => {
+                format!(" ({})", file.path.display())
+            }
+            (Some(file), _, false) => format!(" ({} and options)", file.path.display()),
+            _ => String::new(),
+        };
+        let mut config = layers.resolve(&origin)?;
         if scene != BUILTIN_MODEL && !is_named {
             let set = scene_setting(&config.env.model);
             bail!(
@@ -276,8 +279,8 @@ impl Layers {
         }
     }
 
-    /// The configuration. An error names the file from which it came.
-    fn resolve(mut self, origin: Option<Source>) -> Result<Config> {
+    /// The configuration. An error says where it came from.
+    fn resolve(mut self, origin: &str) -> Result<Config> {
         if self.merged.clone().try_into::<Config>().is_err() {
             self.replace_nonsense();
         }
@@ -293,9 +296,6 @@ impl Layers {
         if self.problems.is_empty() {
             return Ok(config);
         }
-        let origin = origin.map_or(String::new(), |source| {
-            format!(" ({})", source.path.display())
-        });
         bail!(
             "invalid configuration{origin}:\n  {}",
             self.problems.join("\n  ")
@@ -754,6 +754,19 @@ mod tests {
         ] {
             assert!(text.contains(part), "{part}\nis not in\n{text}");
         }
+    }
+
+    #[test]
+    fn a_wrong_option_is_not_blamed_on_the_file_alone() {
+        let message = |text: &str, sets: &[Override]| {
+            let settings = Settings::new().file(file(text)).sets(sets);
+            settings.resolve().unwrap_err().to_string()
+        };
+        let wrong = set("env.rot_eps=0");
+        let alone = message("[env]\nrot_eps = 0", &[]);
+        assert!(alone.starts_with("invalid configuration (x.toml):"));
+        let over = message("", &[wrong]);
+        assert!(over.starts_with("invalid configuration (x.toml and options):"));
     }
 
     #[test]

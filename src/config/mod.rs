@@ -17,38 +17,23 @@ mod settings;
 /// The default configuration, with comments.
 pub const BASE: &str = include_str!("../../configs/repose.toml");
 
+macro_rules! shipped {
+    ($($name:literal)*) => {
+        [$((concat!("configs/", $name), include_str!(concat!("../../configs/", $name)))),*]
+    };
+}
+
 /// The settings files that come with the program: their places in the repository, and their texts.
-pub const SHIPPED: [(&str, &str); 8] = [
-    ("configs/repose.toml", BASE),
-    (
-        "configs/finetune.toml",
-        include_str!("../../configs/finetune.toml"),
-    ),
-    (
-        "configs/isaac-lab.toml",
-        include_str!("../../configs/isaac-lab.toml"),
-    ),
-    (
-        "configs/other-hand.toml",
-        include_str!("../../configs/other-hand.toml"),
-    ),
-    (
-        "configs/randomization-all.toml",
-        include_str!("../../configs/randomization-all.toml"),
-    ),
-    (
-        "configs/randomization-source.toml",
-        include_str!("../../configs/randomization-source.toml"),
-    ),
-    (
-        "configs/repose-continue.toml",
-        include_str!("../../configs/repose-continue.toml"),
-    ),
-    (
-        "configs/repose-robust.toml",
-        include_str!("../../configs/repose-robust.toml"),
-    ),
-];
+pub const SHIPPED: [(&str, &str); 8] = shipped!(
+    "repose.toml"
+    "finetune.toml"
+    "isaac-lab.toml"
+    "other-hand.toml"
+    "randomization-all.toml"
+    "randomization-source.toml"
+    "repose-continue.toml"
+    "repose-robust.toml"
+);
 
 pub use applicability::expect_used;
 pub use differences::{Difference, is_derived, short};

@@ -143,9 +143,8 @@ fn env(config: &Config, rules: &mut Rules) {
     let is_path = (1..=4095).contains(&model.len()) && !model.contains(char::is_control);
     rules.check_part(is_path, "env.model", model, "be a path or \"builtin\"");
     let ratio = env.ctrl_dt / env.sim_dt;
-    let whole = (1.0..=1e4).contains(&ratio.round()) && (ratio / ratio.round() - 1.0).abs() < 1e-6;
     rules.check(
-        whole || ratio.is_nan() || ratio <= 0.0,
+        env.is_multiple_of(env.sim_dt) || ratio.is_nan() || ratio <= 0.0,
         "env.ctrl_dt",
         format!(
             "be a whole multiple of env.sim_dt = {}, at most 10000 times it",

@@ -317,6 +317,13 @@ impl EnvConfig {
         (self.ctrl_dt / self.sim_dt).round() as usize
     }
 
+    /// Whether a control step takes a whole number of physics steps of `sim_dt` seconds, at most 10 000.
+    pub fn is_multiple_of(&self, sim_dt: f64) -> bool {
+        let ratio = self.ctrl_dt / sim_dt;
+        let whole = ratio.round();
+        (1.0..=1e4).contains(&whole) && (ratio / whole - 1.0).abs() < 1e-6
+    }
+
     /// The number of control steps after which an episode is truncated.
     pub fn max_episode_steps(&self) -> u32 {
         (self.max_episode_seconds / self.ctrl_dt).round() as u32

@@ -55,7 +55,7 @@ impl Plan {
         let (plan, made) = match (&args.from_trace, &outputs.page, args.shot.web) {
             (Some(trace), Some(page), _) => (
                 Self::Replay(trace.clone(), page.clone(), outputs.shot),
-                vec![Made::Page],
+                vec![Made::Replay],
             ),
             _ if args.robustness => (
                 Self::Robustness(TableOutput {
@@ -228,11 +228,15 @@ mod tests {
             ),
             (
                 "--from-trace t",
-                "--from-trace cannot be used with a score; it applies only to an HTML file (--out)",
+                "--from-trace cannot be used with a score; it applies only to an HTML file of a trace (--from-trace, --out FILE.html)",
+            ),
+            (
+                "--from-trace t --out x.html --episodes 3",
+                "--episodes cannot be used with an HTML file of a trace (--from-trace, --out FILE.html); it applies only to a window",
             ),
             (
                 "--from-trace t --out x.html --seed 0",
-                "--seed cannot be used with an HTML file",
+                "--seed cannot be used with an HTML file of a trace",
             ),
             (
                 "--out a.gif --out b.mp4",

@@ -24,7 +24,7 @@ pub use episode::{EpisodeStats, StepSums};
 pub use hand::{ACTUATORS, FINGERTIPS, Hand, JOINTS};
 pub use lesson::Lesson;
 pub use observation::{Group, Layout};
-pub use physics::{Physics, QUANTITIES, Quantity, add_settings, is_physical, physical};
+pub use physics::{Physics, QUANTITIES, Quantity, add_settings, physical};
 pub use randomization::{EpisodePhysics, Randomization};
 pub use record::Record;
 pub use reward::{

@@ -174,24 +174,14 @@ pub fn normal(rng: &mut Rng, std: f64) -> f64 {
 pub struct Physics(pub(super) Vec<Vec<f64>>);
 
 impl Physics {
-    /// The physics of the scene as it is.
-    pub(super) fn neutral(hand: &Hand) -> Self {
-        Self(
-            QUANTITIES
-                .iter()
-                .map(|quantity| vec![quantity.neutral(); quantity.count(hand)])
-                .collect(),
-        )
-    }
-
-    /// The physics of the scene with these factors, by the names of quantities.
+    /// The physics of the scene, with these factors by the names of quantities.
     pub(super) fn with(hand: &Hand, factors: &[(&str, f64)]) -> Self {
-        let mut physics = Self::neutral(hand);
-        for (quantity, values) in QUANTITIES.iter().zip(&mut physics.0) {
+        let values = |quantity: &Quantity| {
             let known = factors.iter().find(|(name, _)| *name == quantity.name);
-            known.iter().for_each(|(_, factor)| values.fill(*factor));
-        }
-        physics
+            let value = known.map_or(quantity.neutral(), |(_, factor)| *factor);
+            vec![value; quantity.count(hand)]
+        };
+        Self(QUANTITIES.iter().map(values).collect())
     }
 
     /// The physics that a task sets.
@@ -239,19 +229,12 @@ impl Index<&str> for Physics {
     }
 }
 
-/// Whether a setting of `[env]` says how the world moves, and not when actions take effect or what is seen.
-pub fn is_physical(name: &str) -> bool {
-    let mut names = QUANTITIES
-        .iter()
-        .map(|quantity| quantity.setting)
-        .chain(["cone", "sim_dt"]);
-    name != "action_delay" && names.any(|known| known == name)
-}
-
-/// The settings that say how the world of a task moves.
+/// The settings of `[env]` that say how the world moves, and not when actions take effect or what is seen.
 pub fn physical(config: &EnvConfig) -> Table {
     let mut table = Table::try_from(config).expect("settings are a table");
-    table.retain(|name, _| is_physical(name));
+    let mut names = Vec::from(QUANTITIES.map(|quantity| quantity.setting));
+    names.extend(["cone", "sim_dt"]);
+    table.retain(|name, _| name != "action_delay" && names.contains(&name));
     table
 }
 

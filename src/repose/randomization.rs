@@ -96,7 +96,7 @@ impl Randomization {
         let randomized = rng::uniform(shared, 0.0, 1.0) < probability;
         let is_varied = |rng: &mut Rng| rng::uniform(rng, 0.0, 1.0) < self.config.each;
         let flags = [(); QUANTITIES.len() + 3].map(|()| is_varied(shared));
-        let mut physics = Physics::neutral(hand);
+        let mut physics = Physics::with(hand, &[]);
         for (i, quantity) in QUANTITIES.iter().enumerate() {
             let drawn = quantity.draw(&self.config, hand, shared);
             if flags[i] {

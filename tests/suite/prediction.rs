@@ -129,6 +129,22 @@ fn what_the_user_changes_in_play_changes_the_world_and_not_the_model() {
     assert_eq!((&usual[1], &usual[0]), (&played[1], &played[0]));
     assert_eq!(trained[1], usual[1]);
     assert_ne!(trained[0], usual[0]);
+    let table = ["env={prediction=5,gravity=[0,0,5]}"];
+    let played = loaded.task(&sets(&table)).unwrap();
+    assert_eq!(played.config.gravity, [0.0, 0.0, 5.0]);
+    assert_eq!(played.predicted_with().unwrap().gravity, [0.0; 3]);
+}
+
+#[test]
+fn the_model_steps_as_in_training_unless_that_does_not_divide_the_control_step() {
+    let loaded = Loaded::find(Some("builtin".as_ref()), &[]).unwrap();
+    for (ctrl_dt, expected) in [(0.01, 0.01), (0.02, 0.01), (0.015, 0.005)] {
+        let ctrl_dt = format!("env.ctrl_dt={ctrl_dt}");
+        let played = ["env.prediction=1", "env.sim_dt=0.005", &ctrl_dt];
+        let task = loaded.task(&sets(&played)).unwrap();
+        assert_eq!(task.config.sim_dt, 0.005, "{ctrl_dt}");
+        assert_eq!(task.predicted_with().unwrap().sim_dt, expected, "{ctrl_dt}");
+    }
 }
 
 #[test]
