@@ -201,7 +201,7 @@ pub fn live(
     // Where the policy of each further episode comes from, or the name of an actor.
     let mut path = match &stage.policy {
         Some(policy) => policy.origin.path().to_owned(),
-        None => stage.actor().name().into(),
+        None => stage.actors()[stage.choice].0.into(),
     };
     if let Some(followed) = &followed {
         about.title = followed.run.place().display().to_string();

@@ -5,6 +5,7 @@ use std::io::{BufRead, BufReader, Read, Write};
 use std::net::TcpStream;
 use std::path::Path;
 use std::process::{Child, Command, Stdio};
+use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 use base64::prelude::{BASE64_STANDARD, Engine};
@@ -537,6 +538,8 @@ struct Live {
     port: u16,
     /// The end of the address, from a question mark on.
     query: String,
+    /// What it has said since it said the address.
+    later: Arc<Mutex<String>>,
 }
 
 impl Live {
@@ -550,6 +553,7 @@ impl Live {
             program,
             port: 0,
             query: String::new(),
+            later: Arc::default(),
         };
         let mut said = BufReader::new(live.program.stderr.take().unwrap());
         let mut all = String::new();
@@ -566,7 +570,12 @@ impl Live {
             live.query = query.to_owned();
         }
         // What it says later is read, so that it does not wait.
-        std::thread::spawn(move || std::io::copy(&mut said, &mut std::io::sink()));
+        let later = live.later.clone();
+        std::thread::spawn(move || {
+            for line in said.lines() {
+                *later.lock().unwrap() += &line.unwrap();
+            }
+        });
         live
     }
 
@@ -590,11 +599,16 @@ impl Live {
 
     /// Sends an order as the page itself does, and returns the status of the answer.
     fn order(&self, order: &str) -> String {
+        self.send(&format!("\"{order}\""))
+    }
+
+    /// Sends JSON as the page itself does, and returns the status of the answer.
+    fn send(&self, json: &str) -> String {
         let own = format!("127.0.0.1:{}", self.port);
-        let length = order.len() + 2;
+        let length = json.len();
         let request = format!(
             "POST /controls HTTP/1.1\r\nHost: {own}\r\nOrigin: http://{own}\r\nContent-Type: application/json\r\n\
-             Content-Length: {length}\r\n\r\n\"{order}\""
+             Content-Length: {length}\r\n\r\n{json}"
         );
         status(&self.ask(request.as_bytes())).to_owned()
     }
@@ -835,6 +849,29 @@ fn a_slider_moves_an_actuator_and_only_the_page_can_move_it() {
     );
     assert_eq!(status(&play.ask(request.as_bytes())), "403", "{request}");
     assert_eq!(play.order("goal"), "204");
+}
+
+#[test]
+fn a_slider_changes_the_world_of_later_episodes_without_a_policy() {
+    let folder = tempfile::tempdir().unwrap();
+    for actor in ["zero", "random", "wave"] {
+        let args = ["play", "--ckpt", actor, "--web", "0", "--plain"];
+        let live = Live::start(folder.path(), &[&args[..], &SHORT].concat());
+        let meta: Value = serde_json::from_str(block(&live.get("/"), "meta")).unwrap();
+        let sliders = meta["sliders"].as_array().unwrap();
+        let size = sliders
+            .iter()
+            .position(|slider| slider["name"].as_str().unwrap().starts_with("size"))
+            .unwrap();
+        let mut events = live.events();
+        events.next("hello");
+        assert_eq!(live.send(&format!("[[{size},1.2]]")), "204");
+        for _ in 0..3 {
+            events.next("episode");
+        }
+        let said = live.later.lock().unwrap();
+        assert!(!said.contains("warning"), "{actor}: {said}");
+    }
 }
 
 #[test]
