@@ -31,7 +31,7 @@ pub struct Report {
     metrics: Log<Metrics>,
     /// The settings by dotted key, for TensorBoard's HPARAMS.
     pub hparams: Table,
-    /// The goals of the best evaluation, or NaN if there was none.
+    /// The goals of the best evaluation so far, which is confirmed, once there was one.
     pub best: f64,
     /// The row of TensorBoard's HPARAMS.
     session: Log<EventFile>,
@@ -193,7 +193,6 @@ impl Report {
         self.metrics
             .write(&self.progress, |metrics| metrics.row(&row));
         if !status.evaluation.is_nan() {
-            self.best = self.best.max(status.evaluation);
             let drop_rate = values
                 .iter()
                 .find(|(name, _)| name.as_ref() == "eval/drop_rate");

@@ -46,7 +46,6 @@ impl Lead {
         report.descriptions = described(&tags);
         report.settings = config.to_text();
         report.hparams = config.dotted();
-        report.best = progress.best.map_or(f64::NAN, |[goals, _]| goals);
         Self {
             report,
             saver,
@@ -226,6 +225,7 @@ impl Lead {
             assisted: outcome.iteration.lesson.assist > 0.0,
             shared: false,
         };
+        self.report.best = self.saver.held.last.progress.best.unwrap_or_default()[0];
         self.report.iteration(
             agent.iteration,
             &row(outcome, &ended),

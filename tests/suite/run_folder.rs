@@ -5,6 +5,8 @@ use std::path::Path;
 use std::process::{Command, Output};
 use std::time::{Duration, Instant};
 
+use shadow_repose::ppo::Checkpoint;
+
 use crate::resume::everything;
 use crate::support::{command, metrics, names, preloaded, program, stderr, succeeded, train};
 use crate::survival::{begun, ended_by, endless, iterations, result, resume, send};
@@ -659,6 +661,42 @@ fn a_link_that_takes_the_place_of_the_checkpoints_is_not_followed() {
         (code, names(&folder.path().join("victim")).len()),
         (Some(143), 0)
     );
+}
+
+#[test]
+fn the_best_goals_for_hparams_are_those_of_the_best_evaluation_once_it_was_confirmed() {
+    let folder = tempfile::tempdir().unwrap();
+    let folder = folder.path();
+    let run = folder.join("run");
+    let args = [
+        "--total-steps",
+        "256",
+        "--run-dir",
+        "run",
+        "--set",
+        "env.success_tolerance=3",
+        "--set",
+        "env.max_episode_seconds=2",
+        "--set",
+        "run.eval_episodes=3",
+    ];
+    succeeded(program(folder, &train(&args)));
+    let latest = fs::read(run.join("checkpoints/latest.safetensors")).unwrap();
+    let [best, _] = Checkpoint::parse(&latest).unwrap().progress.best.unwrap();
+    let found: Vec<f32> = crate::support::events(&run.join("hparams"))
+        .iter()
+        .flat_map(|event| event.get_summary().get_value())
+        .filter(|value| value.get_tag() == "best_goals")
+        .map(|value| value.get_simple_value())
+        .collect();
+    let rows = metrics(&run);
+    let column = rows[0].iter().position(|name| name == "eval/goals");
+    let evaluated = rows[1..].iter().map(|row| &row[column.unwrap()]);
+    let highest = evaluated
+        .filter_map(|goals| goals.parse().ok())
+        .fold(0.0, f64::max);
+    assert_ne!(best, highest, "a case in which they differ");
+    assert_eq!(found.last(), Some(&(best as f32)));
 }
 
 #[test]
