@@ -35,10 +35,11 @@ pub fn growth(session: &Session) -> usize {
     let spaces = task.spaces();
     let sample = 4 * (2 * (spaces.observation_size + spaces.action_size) + 8);
     let horizon = config.ppo.horizon_at(config.run.total_steps) + 1;
-    let envs = agent.pool.count();
-    // The outputs of the hidden layers of a minibatch, and their gradients.
     let hidden: usize = config.ppo.hidden.iter().sum();
-    let learner = 8 * config.samples_per_minibatch() * hidden * envs / config.env.num_envs;
+    // The outputs of the hidden layers for a minibatch and their gradients, and a gradient of all parameters for each of 16 groups.
+    let learner =
+        8 * config.samples_per_minibatch() * hidden + 64 * agent.ppo.policy.layout.count();
     let models = (rayon::current_num_threads() + MODELS) * task.scene.size();
-    envs * (CONTACTS + horizon * sample) + GROUP * (ENVIRONMENT + CONTACTS) + models + learner
+    let of_environment = CONTACTS + horizon * sample + learner / config.env.num_envs;
+    agent.pool.count() * of_environment + GROUP * (ENVIRONMENT + CONTACTS) + models
 }

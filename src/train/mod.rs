@@ -372,6 +372,14 @@ mod tests {
         let [short, long] = ["16", "{from=16,to=160000,steps=1000}"].map(session);
         let of_samples = 8 * (160_000 - 16) * 4 * (2 * (157 + 20) + 8);
         assert_eq!(memory::growth(&long) - memory::growth(&short), of_samples);
+        // Each of 16 groups of samples has a gradient of its own.
+        let wide = from_scratch(&[
+            "env.num_envs=8".parse().unwrap(),
+            "ppo.horizon=16".parse().unwrap(),
+            "ppo.hidden=[1024,1024]".parse().unwrap(),
+        ]);
+        let gradient = 4 * wide.agent.ppo.policy.layout.count();
+        assert!(memory::growth(&wide) > 16 * gradient);
         // As many environments evaluate at once, however many episodes that takes.
         let many = from_scratch(&[
             "env.num_envs=8".parse().unwrap(),
