@@ -40,11 +40,14 @@ pub fn processor_seconds() -> f64 {
     time.tv_sec as f64 + 1e-9 * time.tv_nsec as f64
 }
 
-/// Whether other programs use this machine: more threads than it has processors run or wait. Unknown systems are not shared.
+/// Whether other programs use this machine: more threads run or wait than it has processors and than this program has workers. Unknown
+/// systems are not shared.
 pub fn is_shared() -> bool {
     let load = fs::read_to_string("/proc/loadavg").unwrap_or_default();
     let waiting = load.split(' ').next().and_then(|load| load.parse().ok());
-    waiting.is_some_and(|waiting: f64| waiting > 1.5 * Machine::this().processors as f64)
+    waiting.is_some_and(|waiting: f64| {
+        waiting > 1.5 * Machine::this().processors.max(rayon::current_num_threads()) as f64
+    })
 }
 
 /// The number of elements of a list as the kernel writes it, e.g. 5 for `0-3,8`.
