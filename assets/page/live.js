@@ -107,7 +107,7 @@ const STRONGEST = 4; // times the object's weight
 class Touch {
   constructor(player, { at, mass }) {
     const body = player.scene.bodies.findIndex(({ joints }) => joints.some((joint) => joint.type === "free" && joint.at === at));
-    Object.assign(this, { player, body, weight: 9.81 * mass, pointer: null });
+    Object.assign(this, { player, body, weight: 9.81 * mass, pointer: null, newtons: 0 });
     this.sender = new Sender(() => { const { said } = this; this.said = undefined; return said; });
     setInterval(() => this.pull(), AGAIN);
   }

@@ -102,7 +102,7 @@ class Player {
     this.rewards = new Rewards(recording);
     this.lists = new Lists(recording, (row) => this.seek(row), (hand) => this.choose(hand));
     const moment = askedMoment();
-    if (moment) [this.now, this.playing] = [Math.min(recording.last, moment / recording.period), false];
+    if (moment >= 0) [this.now, this.playing] = [Math.min(recording.last, moment / recording.period), false];
     this.listen();
     this.resize();
     if (meta.live) this.follow();
