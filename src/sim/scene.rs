@@ -80,7 +80,7 @@ pub struct Actuator {
     pub(super) id: usize,
     /// Index of its control in `ctrl`.
     pub ctrl: usize,
-    /// Control limits, rad.
+    /// Control limits, rad, or m for a tendon along a path in space.
     pub range: [f64; 2],
 }
 
