@@ -33,11 +33,17 @@ const CHANGES: &[(&str, &[&str])] = &[
     ("env.max_episode_seconds=0.1", &[]),
     ("env.goal_position=[0.33,0,0.31]", &[]),
     ("env.act_moving_average=0.9", &[]),
-    ("env.rot_reward_scale=2", &[]),
+    ("env.rot_reward_scale=2", &["training.task_reward=1"]),
     ("env.rot_eps=0.3", &[]),
-    ("env.dist_reward_scale=-20", &[]),
-    ("env.action_penalty_scale=-0.01", &[]),
-    ("env.reach_goal_bonus=5", &["env.success_tolerance=3"]),
+    ("env.dist_reward_scale=-20", &["training.task_reward=1"]),
+    (
+        "env.action_penalty_scale=-0.01",
+        &["training.task_reward=1"],
+    ),
+    (
+        "env.reach_goal_bonus=5",
+        &["env.success_tolerance=3", "training.task_reward=1"],
+    ),
     ("env.success_tolerance=3", &[]),
     (
         "env.max_consecutive_successes=2",
@@ -54,7 +60,10 @@ const CHANGES: &[(&str, &[&str])] = &[
         ],
     ),
     ("env.fall_dist=0.03", &[]),
-    ("env.fall_penalty=-10", &["env.fall_dist=0.03"]),
+    (
+        "env.fall_penalty=-10",
+        &["env.fall_dist=0.03", "training.task_reward=1"],
+    ),
     ("env.reset_position_noise=0.03", &[]),
     ("env.reset_dof_pos_noise=0.1", &[]),
     ("env.reset_dof_vel_noise=1", &[]),

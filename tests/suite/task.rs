@@ -370,7 +370,6 @@ fn every_scale_of_the_reward_is_a_setting() {
         ("env.dist_reward_scale=-7", 1, -0.7),
         ("env.action_penalty_scale=-0.1", 2, -0.5),
         ("env.success_tolerance=0.35", 3, 2.0),
-        ("env.fall_dist=0.05", 4, 0.0),
     ] {
         for (i, (found, default)) in paid(set).into_iter().zip(default).enumerate() {
             let expected = if i == term { expected } else { default };
@@ -384,8 +383,9 @@ fn every_scale_of_the_reward_is_a_setting() {
         "env.success_tolerance=0.35",
         "env.reach_goal_bonus=9",
         "env.fall_dist=0.05",
+        "env.fall_penalty=-5",
     ]);
-    assert_eq!(task_reward(&both, &step(0.0))[3], 9.0);
+    assert_eq!(task_reward(&both, &step(0.0))[3..], [9.0, -5.0]);
 }
 
 #[test]
