@@ -36,9 +36,10 @@ pub fn growth(session: &Session) -> usize {
     let sample = 4 * (2 * (spaces.observation_size + spaces.action_size) + 8);
     let horizon = config.ppo.horizon_at(config.run.total_steps) + 1;
     let hidden: usize = config.ppo.hidden.iter().sum();
-    // The outputs of the hidden layers for a minibatch and their gradients, and a gradient of all parameters for each of 16 groups.
+    // The outputs of the hidden layers for a minibatch and their gradients. For each parameter, the gradients of 16 groups, and three
+    // values in the bytes of a checkpoint.
     let learner =
-        8 * config.samples_per_minibatch() * hidden + 64 * agent.ppo.policy.layout.count();
+        8 * config.samples_per_minibatch() * hidden + 76 * agent.ppo.policy.layout.count();
     let models = (rayon::current_num_threads() + MODELS) * task.scene.size();
     let of_environment = CONTACTS + horizon * sample + learner / config.env.num_envs;
     agent.pool.count() * of_environment + GROUP * (ENVIRONMENT + CONTACTS) + models
