@@ -21,8 +21,8 @@ impl Diverged {
     /// One object. `state` is MuJoCo's `mj_getState` for `mjSTATE_INTEGRATION` before the first step. `ctrl` holds the
     /// controls of each step in the model's order, and `actions` the policy's actions. In a training run with randomised episodes,
     /// `randomization` is what this one has drawn on top of the settings (null if nothing). `pushes` is then the force on the object
-    /// in each step. `torques` is the torque on the object in each step
-    /// with assistance, and thus shorter than `ctrl` if the assistance began or ended within these steps.
+    /// in each step. `torques` is the torque on the object in each step with assistance. It is shorter than `ctrl` if the assistance
+    /// began or ended within these steps.
     pub fn as_json(&self, config: &EnvConfig, iteration: u64, env: usize) -> String {
         let tail = &self.tail;
         let actions: Vec<_> = tail.actions.chunks_exact(tail.width).collect();
